@@ -111,6 +111,8 @@ OF_CAMERAS = (
              f"{GUIDED}::test_a_pixel_off_the_line_is_four_in_a_photo_zoomed_in"),
     Mutation("stages/poses/guided.py", "undistort(xy, np.array(pose.distortion))", "xy",
              f"{GUIDED}::test_features_are_moved_to_where_a_lens_without_distortion_shows_them"),
+    Mutation("stages/poses/grow.py", "p in wanted if self.added & set(p)]", "p in wanted if False]",
+             f"{GROW}::test_an_added_photo_that_is_pixels_off_comes_back"),
     Mutation("stages/poses/guided.py", "if angles[n, m] <= WIDEST}", "}",
              f"{GUIDED}::test_pairs_are_those_nearest_in_direction"),
     Mutation("stages/poses/rematch.py", "adjust(found, Refine(), principal_point=False)", "pass",

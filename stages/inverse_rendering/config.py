@@ -89,7 +89,7 @@ class Config(StageConfig):
     stereo: Literal["auto", "sweep", "dense", "off"] = Field(
         default=AUTO,
         description="stereo before the fit (prior auto, hull or template); sweep: plane sweep along the hull's "
-        "normals; dense: a depth map for each photo; auto: the one that shows validation views better; off: the "
+        "normals; dense: a depth map for each photo; auto: each where it shows validation views better; off: the "
         "initial geometry as it is",
     )
     # model

@@ -22,8 +22,8 @@ from pipeline import transforms
 from stages.inverse_rendering.dense_stereo import DepthMaps
 from stages.inverse_rendering.depth_kernels import integrate
 from stages.inverse_rendering.initial_geometry import Start
+from stages.inverse_rendering.signed_distance import distances
 from stages.inverse_rendering.smoothest import smoothest
-from stages.inverse_rendering.stereo import distances
 
 F32 = npt.NDArray[np.float32]
 F64 = npt.NDArray[np.float64]

@@ -29,7 +29,8 @@ from pipeline.maths.tracing import box_interval
 from stages.inverse_rendering.dense_stereo import pixel_rays
 from stages.inverse_rendering.initial_geometry import Start
 from stages.inverse_rendering.ray_sampling import WHOLE, PhotoView, evenly_spaced
-from stages.inverse_rendering.stereo import distances, reduced
+from stages.inverse_rendering.signed_distance import distances
+from stages.inverse_rendering.stereo import reduced
 
 F32 = npt.NDArray[np.float32]
 F64 = npt.NDArray[np.float64]

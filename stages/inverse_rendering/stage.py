@@ -217,7 +217,7 @@ def calibrated(capture: Capture, usable: list[int], config: Config, exposures_di
 
 STAGE = Stage(
     name="inverse_rendering",
-    version=54,
+    version=55,
     inputs=Inputs,
     config=Config,
     output=FittedFace,

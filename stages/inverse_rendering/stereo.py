@@ -28,9 +28,9 @@ from pipeline.fields.kernels import look_up
 from pipeline.images import shrink_whole
 from pipeline.maths.correlation import FLOOR, agreement
 from pipeline.maths.tracing import box_interval
-from pipeline.pieces import filled, subject_pieces
 from stages.inverse_rendering.initial_geometry import Start
 from stages.inverse_rendering.ray_sampling import WHOLE, PhotoView, factor_for
+from stages.inverse_rendering.signed_distance import distances
 
 F32 = npt.NDArray[np.float32]
 F64 = npt.NDArray[np.float64]
@@ -326,15 +326,3 @@ def moved(start: Start, points: F64, offset: F64, confidence: F64, reach: float)
     values = start.values.astype(np.float64)
     values[tuple(node.T)] += shift
     return distances(values, start.lo, cell)
-
-
-def distances(values: F64, lo: F32, cell: float) -> F32:
-    """The subject's components of the SDF (X, Y, Z) as a signed distance: to first order near the surface, by a
-    distance transform elsewhere."""
-    slope = np.sqrt(sum(g**2 for g in np.gradient(ndimage.gaussian_filter(values, 1.0), cell)))
-    near = values / np.clip(slope, 0.5, 2.0)
-    solid = filled(subject_pieces(values < 0, lo, cell))
-    inside, outside = ndimage.distance_transform_edt(solid), ndimage.distance_transform_edt(~solid)
-    far = np.where(solid, 0.5 - inside, outside - 0.5) * cell
-    keep = (np.abs(far) < 2 * cell) & (solid == (values < 0))
-    return np.asarray(np.where(keep, near, far), np.float32)

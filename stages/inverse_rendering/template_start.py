@@ -26,7 +26,8 @@ from pipeline.template.model import Template
 from stages.inverse_rendering.initial_geometry import Start
 from stages.inverse_rendering.keep_silhouettes import bound_with_silhouettes
 from stages.inverse_rendering.ray_sampling import WHOLE, PhotoView
-from stages.inverse_rendering.stereo import distances, reduced
+from stages.inverse_rendering.signed_distance import distances
+from stages.inverse_rendering.stereo import reduced
 from stages.inverse_rendering.unseen_rods import RADIUS, without_unseen_rods
 
 # Metres of the template: median distance of the landmarks from a surface that does not have the face. Measured: 1 to

@@ -21,7 +21,7 @@ from scipy.spatial import cKDTree
 from stages.inverse_rendering.footprint import surface_of
 from stages.inverse_rendering.initial_geometry import Start
 from stages.inverse_rendering.ray_sampling import PhotoView, evenly_spaced
-from stages.inverse_rendering.stereo import distances
+from stages.inverse_rendering.signed_distance import distances
 from stages.inverse_rendering.weakly_seen import on_surface, seen_by
 
 F64 = npt.NDArray[np.float64]

@@ -33,11 +33,13 @@ SMALL = 0.1  # of the median score; the lowest of right cameras was .29 of it (a
 CANDIDATES = 20  # photos that one without a camera is compared with
 WEAK = 10  # matches of such a pair that fit one fundamental matrix
 ROUNDS = 8  # of new photos
+WIDENED = (4.0, 2.0, 1.0)  # factors of the band in which an added photo's partners are searched
 
 
 @dataclass(slots=True)
 class Growth:
-    """The photos, and their guided matches by pair, which are kept while photos are added. features: of all sets."""
+    """The photos, and their guided matches by pair, which are kept while photos are added. features: of all sets.
+    added: photos placed by this growth."""
 
     photos: Sequence[Photo]
     sets: Sequence[FeatureSet]
@@ -46,20 +48,34 @@ class Growth:
     progress: Progress
     features: Sequence[Features]
     matches: dict[Pair, Verified] = field(default_factory=dict)
+    added: set[int] = field(default_factory=set)
 
     def rematched(self, model: Model, rounds: int = 1) -> Model:
-        """The model from guided matches of its photos; as it was if these give no points, or lose a photo."""
+        """The model from guided matches of its photos; as it was if these give no points, or lose a photo.
+
+        Matches of added photos are made anew in narrowing bands: in a narrow one around a line that is pixels off, only
+        wrong matches are found, and these confirm the camera.
+        """
         wanted = near_pairs(model.poses)
-        missing = [p for p in wanted if p not in self.matches]
+        uncertain = [p for p in wanted if self.added & set(p)]
+        for widened in WIDENED if uncertain else WIDENED[-1:]:
+            self._match(model, [p for p in wanted if p not in self.matches and p not in uncertain])
+            self._match(model, uncertain, widened)
+            self.tick("refining cameras")
+            found = reconstructed(
+                model, self.photos, self.features, {p: self.matches[p] for p in wanted if p in self.matches},
+                self.config.camera_model, self.scratch / "rematch", self.config.seed, rounds,
+            )  # fmt: skip
+            model = model if found is None or set(found.poses) != set(model.poses) else found
+        return model
+
+    def _match(self, model: Model, pairs: Sequence[Pair], widened: float = 1.0) -> None:
+        """Match these pairs by their cameras, anew if they have matches."""
+        for p in pairs:
+            self.matches.pop(p, None)
         self.matches |= matched(
-            self.sets, lambda s: guided_pairs(model.poses, self.photos, s.features, missing, self.tick)
+            self.sets, lambda s: guided_pairs(model.poses, self.photos, s.features, pairs, self.tick, widened)
         )
-        self.tick("refining cameras")
-        found = reconstructed(
-            model, self.photos, self.features, {p: self.matches[p] for p in wanted if p in self.matches},
-            self.config.camera_model, self.scratch / "rematch", self.config.seed, rounds,
-        )  # fmt: skip
-        return model if found is None or set(found.poses) != set(model.poses) else found
 
     def tick(self, message: str = "matching by cameras") -> None:
         """Show progress; raises to stop."""
@@ -137,6 +153,7 @@ def grown(
                 found[i] = placed.pose
         if not found:
             break
+        own.added |= set(found)
         model = own.rematched(replace(model, poses=dict(sorted({**model.poses, **found}.items()))))
     if len(model.poses) == before:
         return None

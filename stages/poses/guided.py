@@ -79,10 +79,10 @@ def near_pairs(poses: Mapping[int, Pose], partners: int = PARTNERS) -> list[Pair
 
 def guided_pairs(
     poses: Mapping[int, Pose], photos: Sequence[Photo], features: Sequence[Features], pairs: Sequence[Pair],
-    tick: Callable[[], None],
+    tick: Callable[[], None], widened: float = 1.0,
 ) -> dict[Pair, Verified]:  # fmt: skip
     """Guided matches of these pairs of photos with a camera; pairs with fewer than FEWEST, or from one place, are left
-    out. tick: called before each pair; raises to stop."""
+    out. tick: called before each pair; raises to stop. widened: factor of the band, for cameras that are less exact."""
     without = {i: straight(features[i], poses[i]) for i in sorted({i for p in pairs for i in p})}
 
     def one(pair: Pair) -> Verified | None:
@@ -92,7 +92,7 @@ def guided_pairs(
             F = fundamental(poses[i], poses[j])
         except ValueError:
             return None
-        found = Verified(F, guided(without[i], without[j], F, EPIPOLAR_LIMIT * edge))
+        found = Verified(F, guided(without[i], without[j], F, widened * EPIPOLAR_LIMIT * edge))
         once = without_repeats(found, features[i], features[j], REPEAT * edge)
         return once if len(once.matches) >= FEWEST else None
 

@@ -194,14 +194,11 @@ def test_work_grows_with_what_it_is_done_on(tmp_path: Path, counts: Counts) -> N
 
 
 def test_what_was_not_made_costs_nothing(counts: Counts) -> None:
-    assert floors.depth_maps(dataclasses.replace(counts, whole_maps=True)) > 2 * floors.depth_maps(counts) > 0
+    assert floors.depth_maps(dataclasses.replace(counts, fitted=20)) == 2.5 * floors.depth_maps(counts) > 0
     for stereo, has in (("sweep", (True, False)), ("off", (False, False)), ("dense", (True, True))):
         changed = dataclasses.replace(counts, settings={**counts.settings, "inverse_rendering.stereo": stereo})
         assert (floors.swept(changed) > 0, floors.depth_maps(changed) > 0) == has
     assert floors.template(counts) == Work()
-    auto = {**counts.settings, "inverse_rendering.stereo": "auto"}
-    both = floors.depth_maps(dataclasses.replace(counts, settings=auto, whole_maps=True))
-    assert both == pytest.approx(floors.depth_maps(counts) + floors.depth_maps(changed))
     unchecked = dataclasses.replace(counts, settings={**counts.settings, "poses.check": False})
     assert floors.poses(unchecked).jpeg == 0 and floors.poses(counts).jpeg == counts.jpeg
 
@@ -220,7 +217,7 @@ def test_counts_are_those_of_the_manifests(counts: Counts) -> None:
     assert (counts.photos, counts.fitted, counts.held) == (10, 8, 2)
     assert counts.jpeg == 10 * SIZE**2 and counts.png == 0 and counts.sources == 10_000
     assert counts.bytes["inverse_rendering"] == 5000 and counts.bytes["masks"] == 500
-    assert counts.subject == 0.25 and not counts.solved and not counts.person and not counts.whole_maps
+    assert counts.subject == 0.25 and not counts.solved and not counts.person
     assert counts.texels == 256**2 / 2 and counts.exr_maps == 4 * 256**2 and counts.png_maps == 3 * 256**2
     assert counts.setting("bake.size") == 1024 and counts.seconds["bake"] == 3.0
 

@@ -20,8 +20,8 @@ class Counts:
 
     photos, fitted, held: numbers of views. jpeg, png: pixels of the photos by the kind of file; sources: their bytes.
     subject: mean share of a photo that is subject. solved: whether cameras were solved; person: whether masks are of
-    the network for people, with refined contours. order, rank: results of the fit; whole_maps: whether it made whole
-    depth maps. faces, cell: of the dense surface (metres). template: whether the asset is made from it. render: faces
+    the network for people, with refined contours. order, rank: results of the fit. faces, cell: of the dense
+    surface (metres). template: whether the asset is made from it. render: faces
     of the textured mesh; texels: under charts; exr_maps, png_maps: texels of one channel in all maps' files of a kind.
     """
 
@@ -39,7 +39,6 @@ class Counts:
     person: bool
     order: int = 0
     rank: int = 0
-    whole_maps: bool = False
     faces: int = 0
     cell: float = 0.0
     template: bool = False
@@ -121,7 +120,6 @@ def counts_of(out: Path) -> Counts:
         person=any(m["source"].startswith("person") for m in masks),
         order=int(fit.get("light_order", 0)),
         rank=int(fit.get("rank", 0)),
-        whole_maps="small" not in str(fit.get("model", {}).get("stereo", {}).get("why", "small")),
         faces=int(surface.get("faces", 0)),
         cell=float(surface.get("cell", 0.0)),
         template=bool(uv.get("of_template")),

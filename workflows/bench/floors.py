@@ -185,18 +185,16 @@ def swept(c: Counts) -> float:
 
 
 def depth_maps(c: Counts) -> float:
-    """Operations of the depth maps: the small ones, and the whole ones where the fit made them."""
+    """Operations of the depth maps."""
     from stages.inverse_rendering import dense_stereo as dense
-    from stages.inverse_rendering.stereo_choice import QUICK
 
     if c.choice("inverse_rendering.stereo") in ("off", "sweep"):
         return 0.0
-    chosen = c.choice("inverse_rendering.stereo") == "auto"
-    scales = ([QUICK] if chosen else []) + ([1.0] if c.whole_maps or not chosen else [])
-    per_view = 0.5 * (
-        dense.COARSE**2 * PLANES * dense.NEIGHBOURS * PLANE + dense.FINE**2 * TRIALS * dense.REFINED * PATCH
+    return (
+        c.fitted
+        * 0.5
+        * (dense.COARSE**2 * PLANES * dense.NEIGHBOURS * PLANE + dense.FINE**2 * TRIALS * dense.REFINED * PATCH)
     )
-    return c.fitted * per_view * sum(s * s for s in scales)
 
 
 def surface(c: Counts) -> Work:
