@@ -23,6 +23,7 @@ from stages.inverse_rendering.stereo_scores import mean_score, shown_by, validat
 Facts = dict[str, str | float | bool]
 log = logging.getLogger("neuface.inverse_rendering")
 VALIDATION, MIN_VIEWS = 12, 8  # validation views at most; with fewer views than MIN_VIEWS: the sweep
+SHORT = SWEEPS[1:]  # sweeps of a surface whose normals are right: they add what fusion smoothed
 
 
 def stereo_start(
@@ -34,28 +35,33 @@ def stereo_start(
     sweeps: tuple[Sweep, ...] = SWEEPS,
 ) -> tuple[Start, Facts]:
     """The start from stereo, and its figures. kind: auto, sweep or dense. sweeps: those along the hull's normals."""
-
-    def swept(start: Start, seen: list[PhotoView], steps: tuple[Sweep, ...]) -> Start:
-        return start_from_photos(start, seen, device, check, steps)
-
     if kind == "sweep" or (kind == "auto" and len(views) < MIN_VIEWS):
         why = "setting" if kind == "sweep" else f"fewer than {MIN_VIEWS} views"
-        return swept(hull, views, sweeps), {"start": "sweep", "why": why}
+        return start_from_photos(hull, views, device, check, sweeps), {"start": "sweep", "why": why}
     if kind == "dense":
-        return swept(fused(hull, depth_maps(hull, views, check), check), views, SWEEPS[1:]), {
-            "start": "dense",
-            "why": "setting",
-        }
+        whole = fused(hull, depth_maps(hull, views, check), check)
+        return start_from_photos(whole, views, device, check, SHORT), {"start": "dense", "why": "setting"}
+    return _both(hull, views, device, check, sweeps)
+
+
+def _both(
+    hull: Start, views: list[PhotoView], device: str, check: Callable[[], None], sweeps: tuple[Sweep, ...]
+) -> tuple[Start, Facts]:
+    """The start of sweep and depth maps, each where it shows the validation views better."""
+
+    def swept(start: Start, seen: list[PhotoView], steps: tuple[Sweep, ...] = SHORT) -> Start:
+        return start_from_photos(start, seen, device, check, steps)
+
     waiting = validation_views(len(views))
     seen = [v for n, v in enumerate(views) if n not in waiting]
     validation = validation_of(hull, views, waiting)
     sweep = swept(hull, seen, sweeps)
     maps = depth_maps(hull, views, check, waiting)
-    dense = swept(fused(hull, without(maps, waiting), check), seen, SWEEPS[1:])
+    dense = swept(fused(hull, without(maps, waiting), check), seen)
     one, two = shown_by(sweep, validation, check), shown_by(dense, validation, check)
     share = share_of_maps(one, two, validation, hull)
-    whole = swept(fused(hull, maps, check), views, SWEEPS[1:])
-    start = swept(blended(sweep, whole, share), views, sweeps[1:] or sweeps)
+    start = blended(sweep, swept(fused(hull, maps, check), views), share)
+    start = swept(start, views, sweeps[1:] or sweeps)
     facts: Facts = {
         "start": "both",
         "sweep_correlation": round(mean_score(one, validation), 4),
