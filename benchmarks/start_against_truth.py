@@ -1,4 +1,4 @@
-"""How far the fit's start lies from the truth: the visual hull, the hull moved by the sweep, and fused depth maps.
+"""How far the fit's start lies from the truth: the visual hull, moved by the sweep, fused depth maps, and both.
 
     python benchmarks/start_against_truth.py RUN_DIR TRUTH_MESH [--side 512] [--cells 288]
 
@@ -84,6 +84,9 @@ def main() -> None:
     begun = time.perf_counter()
     dense, _ = stereo_start(hull, views, "dense", "cpu")
     print("depth maps  ", told(dense, to_world, truth), f"({time.perf_counter() - begun:.0f} s)")
+    begun = time.perf_counter()
+    both, _ = stereo_start(hull, views, "auto", "cpu")
+    print("both        ", told(both, to_world, truth), f"({time.perf_counter() - begun:.0f} s)")
 
 
 if __name__ == "__main__":

@@ -94,13 +94,12 @@ def depth_maps(
     views: list[PhotoView],
     check: Callable[[], None] = lambda: None,
     alone: tuple[int, ...] = (),
-    scale: float = 1.0,
 ) -> DepthMaps:
     """Consistent depth maps of all views within the hull. check: raises if the run was cancelled. alone: positions of
-    views that are nobody's neighbour, so that the other views' depths do not depend on them. scale: of the pictures."""
+    views that are nobody's neighbour, so that the other views' depths do not depend on them."""
     poses = np.stack([v.world_from_cam for v in views])
     neighbours = neighbours_of(hull, views, alone)
-    coarse, fine = (pictures_of(views, hull, round(scale * side)) for side in (COARSE, FINE))
+    coarse, fine = (pictures_of(views, hull, side) for side in (COARSE, FINE))
     planes = np.full((*fine.grey.shape, 3), np.nan, np.float32)
     score = np.full(fine.grey.shape, kernels.FAILED, np.float32)
 

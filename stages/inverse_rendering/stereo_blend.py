@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 
+from stages.inverse_rendering.dense_stereo import pixel_rays
 from stages.inverse_rendering.initial_geometry import Start
 from stages.inverse_rendering.signed_distance import distances
 from stages.inverse_rendering.stereo_scores import Shown, Validation, mean_score
@@ -50,11 +51,10 @@ def _add(difference: F32, inverse: F32, view: int, views: Validation, grid: Star
     """Add a view's pixels to the nodes nearest to them: weights are areas in cells."""
     pictures = views.pictures
     rows, columns = np.nonzero((inverse > 0) & pictures.usable[view])
-    w = inverse[rows, columns].astype(np.float64)
-    K, pose = pictures.K[view], views.poses[view]
-    pixels = np.stack([columns + 0.5, rows + 0.5, np.ones(len(rows))], -1)
-    points = (pixels @ np.linalg.inv(K).T / w[:, None]) @ pose[:3, :3].T + pose[:3, 3]
-    node = np.rint((points - grid.lo) / grid.cell).astype(np.intp)
+    w = inverse[rows, columns]
+    K = pictures.K[view]
+    o, d, length = pixel_rays(K, views.poses[view], rows, columns)
+    node = np.rint(((o.numpy() + (length / w)[:, None] * d.numpy()) - grid.lo) / grid.cell).astype(np.intp)
     inside = ((node >= 0) & (node < total.shape)).all(1)
     at, area = tuple(node[inside].T), ((1 / (K[0, 0] * w * grid.cell)) ** 2)[inside]
     np.add.at(total, at, area * difference[rows, columns][inside])

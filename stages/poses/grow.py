@@ -58,8 +58,8 @@ class Growth:
         """
         wanted = near_pairs(model.poses)
         uncertain = [p for p in wanted if self.added & set(p)]
+        self._match(model, [p for p in wanted if p not in self.matches and not self.added & set(p)])
         for widened in WIDENED if uncertain else WIDENED[-1:]:
-            self._match(model, [p for p in wanted if p not in self.matches and p not in uncertain])
             self._match(model, uncertain, widened)
             self.tick("refining cameras")
             found = reconstructed(

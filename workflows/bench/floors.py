@@ -190,11 +190,9 @@ def depth_maps(c: Counts) -> float:
 
     if c.choice("inverse_rendering.stereo") in ("off", "sweep"):
         return 0.0
-    return (
-        c.fitted
-        * 0.5
-        * (dense.COARSE**2 * PLANES * dense.NEIGHBOURS * PLANE + dense.FINE**2 * TRIALS * dense.REFINED * PATCH)
-    )
+    sweep = dense.COARSE**2 * PLANES * dense.NEIGHBOURS * PLANE
+    refinement = dense.FINE**2 * TRIALS * dense.REFINED * PATCH
+    return 0.5 * c.fitted * (sweep + refinement)
 
 
 def surface(c: Counts) -> Work:
