@@ -254,8 +254,9 @@ class FittedFace(Artifact):
     """The fitted field. `field`: npz of every parameter (see pipeline.fields.face). The figures are from the fit.
     refined: fitted photos whose cameras the fit moved (pipeline.fitted_cameras). registered: held-out photos, for
     figures without the error of their cameras; nothing else uses these poses. photos: the fitted
-    photos, as the finished fit shows them. second: of a second capture that was fitted as well; without one, the
-    manifest does not have the entry."""
+    photos, as the finished fit shows them. surroundings: npz of what the photos show behind the subject
+    (pipeline.lighting.surroundings), None where that tells nothing of the light. second: of a second capture that was
+    fitted as well; without one, the manifest does not have the entry."""
 
     field: FileRef
     light: FileRef
@@ -272,6 +273,7 @@ class FittedFace(Artifact):
     refined: tuple[RefinedCamera, ...] = ()
     registered: tuple[RegisteredView, ...] = ()
     photos: tuple[FittedPhoto, ...] = ()
+    surroundings: FileRef | None = None
     second: SecondFitted | None = None
     warnings: tuple[str, ...] = ()
     findings: tuple[Finding, ...] = ()

@@ -13,6 +13,7 @@ import numpy.typing as npt
 from pipeline import footprint, meshes, raster, tangents, tiles
 from pipeline.errors import StageError
 from pipeline.fields.protocol import Field
+from pipeline.lighting.surroundings import Surroundings
 from pipeline.meshes import F32, F64, Charts, Indices, Mask, Mesh
 from pipeline.smoothing import continued
 from pipeline.visibility import FittedPhoto, Occluder
@@ -106,13 +107,15 @@ class Baker:
         hair_code: int = -1,
         measured: Measured | None = None,
         even: Even | None = None,
+        surroundings: Surroundings | None = None,
     ) -> None:
         """`photos`: adds their fine detail to the albedo. `scratch`: folder for arrays that do not fit in memory.
         `skin_code`: label of skin in the photos. `fit_standard`: fit the standard shaders to the photos, if given.
         `eyes`: the fitted eyes of the template; `mouth`: the inside of its mouth. `region` (V,): of the head, of each
         vertex (head_regions.region_of); None: one region. `hair` (V,): vertices of the mesh of hair, which
         is the last tile, with the label `hair_code`. `measured`: what a light stage says, of the first tile.
-        `even`: takes errors of the light out of the base colour of skin (even_skin.py)."""
+        `even`: takes errors of the light out of the base colour of skin (even_skin.py). `surroundings`: what the photos
+        show behind the subject."""
         self.tiles = tiles.count(charts)
         self.lut, self.residual = basis_lut(field)
         self._field, self._whole, self._views, self._size = field, (mesh, charts), views, size
@@ -135,7 +138,7 @@ class Baker:
             seen = self._known.unseen < 0.5
             fitted = standard_material(
                 field, mesh, views, skin_code, seen, self._found, lambda: step(0, 1, "standard material"), hair,
-                self._known.albedo, region, even,
+                self._known.albedo, region, even, surroundings,
             )  # fmt: skip
             if fitted.plausible:
                 standard, self.material_figures = fitted, fitted.figures

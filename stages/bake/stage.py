@@ -92,6 +92,7 @@ def _within(maps: Mapping[str, TextureMap], folder: str) -> dict[str, TextureMap
 def _baked(inputs: Inputs, config: Config, context: Context) -> TextureSet:
     from pipeline import footprint, meshes
     from pipeline.fields.face import load_face
+    from pipeline.lighting.surroundings import surroundings_of
     from pipeline.people import shows_person
     from pipeline.visibility import seen_by
     from stages.bake.build import Baker, Photos
@@ -131,7 +132,7 @@ def _baked(inputs: Inputs, config: Config, context: Context) -> TextureSet:
     baker = Baker(
         field, mesh, charts, views, config.size, step, photos, context.scratch, skin, config.fit_standard, eyes, mouth,
         region, hair, labels.index("hair") if "hair" in labels else -1,
-        measured_of(inputs.reflectance, config.size), even,
+        measured_of(inputs.reflectance, config.size), even, surroundings_of(fitted),
     )  # fmt: skip
     parts, sides, counted, judged, shades, areas = [], [], [], [], [], Counter[int]()
     for number in range(baker.tiles):
@@ -206,4 +207,4 @@ def responses(field: FittedField, exposures: Sequence[float]) -> F64:
     return np.asarray(e * (np.eye(3) if fitted is None else fitted), np.float64)
 
 
-STAGE = Stage(name="bake", version=42, inputs=Inputs, config=Config, output=TextureSet, run=run)
+STAGE = Stage(name="bake", version=43, inputs=Inputs, config=Config, output=TextureSet, run=run)

@@ -8,11 +8,12 @@ from dataclasses import replace
 import numpy as np
 
 from pipeline.fields.protocol import Field
-from pipeline.lighting.dome import environment
+from pipeline.lighting.captured import captured_environment
 from pipeline.lighting.median_cut import lamps
 from pipeline.lighting.moving import MovingLight, Standpoint
 from pipeline.lighting.moving_standard import MovingLamps
 from pipeline.lighting.standard import COUNT, Arrivals, arrivals
+from pipeline.lighting.surroundings import Surroundings
 from pipeline.meshes import F32, F64, Indices, Mask, Mesh, unit
 from pipeline.polarised import specular
 from pipeline.smoothing import continued
@@ -35,11 +36,12 @@ MIN_FACING = 0.3  # least cosine between the mesh's normal and the field's gradi
 def standard_material(
     field: Field, mesh: Mesh, views: Sequence[FittedPhoto], skin_code: int, seen: Mask, found: Detail,
     check: Callable[[], None], hair: Mask | None = None, look: F32 | None = None, region: Indices | None = None,
-    even: Even | None = None,
+    even: Even | None = None, surroundings: Surroundings | None = None,
 ) -> standard_fit.Fitted:  # fmt: skip
     """The fitted material at the vertices. skin_code: label of the face in the photos, -1 for none; seen, hair (V,);
     look (V, 3): the albedo with what photos do not show filled, region (V,): of the head (skin.skin_of); even: takes
-    errors of the light out of the base colour (V, 3) of seen skin (V,) (even_skin.py)."""
+    errors of the light out of the base colour (V, 3) of seen skin (V,) (even_skin.py); surroundings: what the photos
+    show behind the subject."""
     normals = field_normals(field, mesh)
     albedo = field.material(mesh.vertices).albedo.astype(np.float64)
     thin = thinned(len(mesh.vertices), mesh.faces)
@@ -49,7 +51,7 @@ def standard_material(
     moving = field.moving_light
     at: Lit | Arrivals
     if moving is None:
-        lit = lamps(environment(field.light, DOME_WIDTH), COUNT)
+        lit = lamps(captured_environment(field.light, DOME_WIDTH, surroundings), COUNT)
         at = arrivals(mesh.vertices, normals.astype(np.float32), mesh.faces, lit, albedo, check)
     else:
         poses = [matrix(v.camera.world_from_cam) for v in views]

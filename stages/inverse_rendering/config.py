@@ -122,6 +122,11 @@ class Config(StageConfig):
         "which the subject turns; camera: relative to the camera; flash: a lamp on the camera, whose light falls off "
         "with the distance; auto: by cross-validation before the fit and by the photos' metadata",
     )
+    surroundings: bool = Field(
+        default=True,
+        description="the captured light shows what the photos show behind the subject, for example a window; off: only "
+        "what the subject tells of the light, and no picture of the room is in the asset",
+    )
     skin_light: bool = Field(
         default=True,
         description="correct the low bands of the light during the fit so that the albedo of the skin does not depend "

@@ -14,14 +14,18 @@ from pipeline.colour import as_photographed
 from pipeline.contract import Context
 from pipeline.fields.face import FaceModel, FittedField
 from pipeline.images import write_exr, write_png_from_linear
+from pipeline.lighting.surroundings import Backdrop, Surroundings, evenly, surroundings
 from stages.inverse_rendering.footprint import Footprint
 from stages.inverse_rendering.load_views import camera_only
 from stages.inverse_rendering.ray_sampling import PhotoView, factor_for, image_rays
+from stages.inverse_rendering.refine_poses import response_of
 from stages.inverse_rendering.residuals import ViewError
 from stages.inverse_rendering.systems import render_any
 from stages.inverse_rendering.training_loop import TrainingLoop
 
 F32 = npt.NDArray[np.float32]
+
+SURROUNDINGS, SURROUNDED = "surroundings.npz", 96  # the file, and the most photos that are asked
 
 
 def write_light(model: FaceModel, context: Context) -> None:
@@ -39,6 +43,19 @@ def write_light(model: FaceModel, context: Context) -> None:
     if moving is not None:
         content["moving"] = moving.stored()
     (context.workdir / "light.json").write_text(json.dumps(content, indent=1))
+
+
+def write_surroundings(model: FaceModel, views: Sequence[PhotoView], context: Context) -> Surroundings | None:
+    """Write surroundings.npz of the first capture's photos `views`, in the model's order; None, and no file, where they
+    tell nothing."""
+    own = [(n, v) for n, v in enumerate(views) if not v.second]
+    found = surroundings(
+        Backdrop(v.rgb, v.alpha, v.clipped, v.K, v.world_from_cam, v.distortion, response_of(model, n))
+        for n, v in (own[i] for i in evenly(len(own), SURROUNDED))
+    )
+    if found is not None:
+        found.save(context.workdir / SURROUNDINGS)
+    return found
 
 
 def predict_held_out(

@@ -64,6 +64,7 @@ def run_both(inputs: BothInputs, config: Config, context: Context) -> FittedFace
 def fit(inputs: Inputs, config: Config, context: Context, other: Other | None) -> FittedFace:
     """Fit the field to a capture, or to two of one subject, and predict the held-out views."""
     from pipeline.faces.landmarks3d import load_landmarks, photos_of_face
+    from pipeline.maths.light_frame import WORLD
     from stages.inverse_rendering.albedo_level import set_level
     from stages.inverse_rendering.choose_start import choose_start
     from stages.inverse_rendering.exposure import DRIFT, exposures_differ
@@ -75,7 +76,14 @@ def fit(inputs: Inputs, config: Config, context: Context, other: Other | None) -
     from stages.inverse_rendering.load_views import read_labels, read_views
     from stages.inverse_rendering.moving_light import light_frame
     from stages.inverse_rendering.outline_level import set_outline_level
-    from stages.inverse_rendering.outputs import fitted_photos, model_facts, predict_held_out, write_light
+    from stages.inverse_rendering.outputs import (
+        SURROUNDINGS,
+        fitted_photos,
+        model_facts,
+        predict_held_out,
+        write_light,
+        write_surroundings,
+    )
     from stages.inverse_rendering.preview import Preview
     from stages.inverse_rendering.registered_views import registered_views
     from stages.inverse_rendering.residuals import view_errors
@@ -164,6 +172,8 @@ def fit(inputs: Inputs, config: Config, context: Context, other: Other | None) -
         model = every.of_light(second=False)
     model.save(context.workdir / "field.npz")
     write_light(model, context)
+    still = known is None and (lit is None or lit.frame == WORLD)
+    around = write_surroundings(model, views, context) if config.surroundings and still else None
     widths = {c.index: c.width for c in cameras} | (other.widths if other is not None else {})
     colours = held_out_colours(model, inputs.capture.artifact, inputs.poses.artifact, usable)
     held_out = predict_held_out(
@@ -177,6 +187,8 @@ def fit(inputs: Inputs, config: Config, context: Context, other: Other | None) -
         facts["held_out_colours"] = colours.facts
     if lit is not None:
         facts["light_frame"] = lit.facts()
+    if around is not None:
+        facts["surroundings"] = dict(around.facts())
     sizes = settings.image_side, settings.samples
     both, weights = view_errors(every, trainer.pixels, views, *sizes, labels, names), trainer.photo_weights()
     left, added = [e for e in both if other is None or e.index < other.offset], None
@@ -201,6 +213,7 @@ def fit(inputs: Inputs, config: Config, context: Context, other: Other | None) -
         refined=tuple(c for c in trainer.refined_cameras(widths) if c.index in set(usable)),
         registered=registered,
         photos=fitted_photos(left, usable, weights[: len(usable)]),
+        surroundings=None if around is None else context.file(SURROUNDINGS),
         second=added,
         findings=findings(fitted),
     )
@@ -217,7 +230,7 @@ def calibrated(capture: Capture, usable: list[int], config: Config, exposures_di
 
 STAGE = Stage(
     name="inverse_rendering",
-    version=55,
+    version=56,
     inputs=Inputs,
     config=Config,
     output=FittedFace,

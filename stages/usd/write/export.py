@@ -18,7 +18,9 @@ from pipeline.errors import StageError
 from pipeline.fitted_cameras import cameras_of
 from pipeline.head_artifacts import RegisteredHead
 from pipeline.images import write_exr
-from pipeline.lighting.dome import environment, environment_figures, light_json, read_light, read_moving
+from pipeline.lighting.captured import captured_environment, irradiance_error
+from pipeline.lighting.dome import environment_figures, light_json, read_light, read_moving
+from pipeline.lighting.surroundings import surroundings_of
 from pipeline.reflectance_artifacts import ReflectanceField
 from stages.usd.config import Config
 from stages.usd.layout import LIGHT
@@ -133,10 +135,13 @@ def export(
         layers[HIGH_FILE] = (component.high_layer(high, look, materials), "usdc")
     for file, (layer, form) in layers.items():
         write_layer(layer, folder / file, form)
-    dome = environment(light, config.environment_width)
+    around = surroundings_of(face) if moving is None else None
+    dome = captured_environment(light, config.environment_width, around)
     write_exr(folder / "environment.exr", dome, half=True)
     domes = [] if moving is None else write_domes(moving, folder, config.environment_width)
     figures = maps.figures | environment_figures(light, dome)
+    if around is not None:
+        figures["light_irradiance_error_seen"] = round(irradiance_error(light, dome, around), 5)
     (folder / LIGHT).write_text(light_json(light, face.artifact.attenuation, moving))
     scripts = (BLENDER, *([SCATTER] if scatters else []))
     for script in scripts:
