@@ -9,7 +9,7 @@ import numpy as np
 
 from pipeline.fields.protocol import Field
 from pipeline.lighting.captured import captured_environment
-from pipeline.lighting.median_cut import lamps
+from pipeline.lighting.median_cut import Lamps, lamps
 from pipeline.lighting.moving import MovingLight, Standpoint
 from pipeline.lighting.moving_standard import MovingLamps
 from pipeline.lighting.standard import COUNT, Arrivals, arrivals
@@ -51,7 +51,7 @@ def standard_material(
     moving = field.moving_light
     at: Lit | Arrivals
     if moving is None:
-        lit = lamps(captured_environment(field.light, DOME_WIDTH, surroundings), COUNT)
+        lit = exported_lamps(field.light, surroundings)
         at = arrivals(mesh.vertices, normals.astype(np.float32), mesh.faces, lit, albedo, check)
     else:
         poses = [matrix(v.camera.world_from_cam) for v in views]
@@ -64,6 +64,11 @@ def standard_material(
     return replace(
         out, correction=(correction * evened.factor).astype(np.float32), figures=out.figures | evened.figures
     )
+
+
+def exported_lamps(light: F32, surroundings: Surroundings | None) -> Lamps:
+    """The exported dome, whose harmonics are `light`, as lamps."""
+    return lamps(captured_environment(light, DOME_WIDTH, surroundings), COUNT)
 
 
 def carried(

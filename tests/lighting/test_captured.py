@@ -88,6 +88,16 @@ def test_a_clipped_window_gets_the_brightness_that_the_subject_tells(brightness:
     assert picture[window].min() > 0.99
 
 
+def test_a_window_behind_thin_bars_is_as_bright() -> None:
+    """Pixels of the sum of squares are coarser, and partly clipped."""
+    truth = room()
+    bars = lamp((0.4, 0.1, -1), 25) * (np.arange(W) % 2)
+    truth = truth + 10 * bars[..., None]
+    shown = replace(around(truth, seen_from=120), facing=np.ones((H, W), np.float32))
+    picture = captured_environment(light_from_environment(truth.astype(np.float32)), W, shown)
+    assert picture[bars > 0].mean() == pytest.approx(10, rel=0.15)
+
+
 def test_colours_are_those_of_the_light() -> None:
     tint = np.array([1.0, 0.6, 0.3])
     truth = room() * tint

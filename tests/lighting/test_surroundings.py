@@ -77,6 +77,22 @@ def test_each_photos_colours_are_undone() -> None:
     assert ignored is not None and np.median(errors(ignored)) > 0.05
 
 
+def test_the_lens_counts() -> None:
+    """A bright stripe near the frame's edge lies where the distorted ray through it points."""
+    lens = np.array([0.4, 0.0, 0.0, 0.0, 0.0])
+    K = np.array([[FOCAL, 0, SIDE / 2], [0, FOCAL, SIDE / 2], [0, 0, 1]])
+    row, column = np.mgrid[:SIDE, :SIDE] + 0.5
+    d = rays(K, pose(0), lens, np.stack([column.ravel(), row.ravel()], 1))[1].reshape(SIDE, SIDE, 3)
+    right = d @ pose(0)[:3, 0] > 0.38
+    alpha = (np.hypot(row - SIDE / 2, column - SIDE / 2) < 10).astype(np.float32)
+    rgb = (0.1 + 0.8 * right[..., None] + np.random.default_rng(0).normal(0, 0.003, d.shape)).astype(np.float32)
+    found = surroundings([Backdrop(rgb, alpha, None, K, pose(0), lens, np.eye(3))])
+    assert found is not None
+    shown = found.away < 1e-4
+    bright = latlong_directions(256, 128) @ pose(0)[:3, 0] > 0.38
+    assert ((found.radiance[..., 0] > 0.5) == bright)[shown].mean() > 0.98
+
+
 def test_a_hand_in_one_photo_does_not_count() -> None:
     photos = [photo(pose(a), n) for n, a in enumerate((0, 4, 8, 12, 16))]
     photos[2].rgb[:, :40] = 0.9
