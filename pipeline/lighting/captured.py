@@ -47,16 +47,21 @@ FREE = 0.1, 0.01  # factors of the tie of the mean, and of the clipped places: t
 NEAR, FAR = np.radians(5.0), np.radians(20.0)
 SOLVE_WIDTH, STEPS, DAMPING, ENOUGH = 64, 60, 0.6, 1e-4
 LOWEST = 4  # order up to which irradiance is compared, also of a light with fewer: higher ones hardly reach it
+CONTRADICTS = 0.15  # error of the irradiance from which what photos show and what the subject received disagree
 KNOWN = 0.9  # share from which a place counts for the median
 
 
 def captured_environment(light: F32, width: int, around: Surroundings | None) -> F32:
     """(width / 2, width, 3) picture of the captured light, nowhere negative, for any renderer. light: its fitted
-    harmonics ((L + 1)^2, 3); around: what the photos show; None: `dome.environment`."""
+    harmonics ((L + 1)^2, 3); around: what the photos show. `dome.environment` without it, and where no picture that
+    shows it has the irradiance that the subject received: the level of the light may be wrong, where nothing tells
+    it."""
     problem = None if around is None else _Problem.of(light, around)
     if around is None or problem is None:
         return environment(light, width)
     picture = problem.picture(problem.solve(), around)
+    if irradiance_error(light, picture, around) > CONTRADICTS:
+        return environment(light, width)
     return np.asarray(_resized(picture, width).reshape(width // 2, width, 3), np.float32)
 
 

@@ -33,6 +33,7 @@ I32 = npt.NDArray[np.int32]
 Indices = npt.NDArray[np.integer]
 
 LIFT = 1e-3  # of the subject's size: rays start this far above the surface, against self-shadowing of facets
+BENEATH = 0.01  # of the subject's size: what lies less deep beneath another part of the surface is that part's
 GRAZING = -0.2  # least cosine of lamps at a vertex: others can't light its triangles' interpolated normals
 BESIDE = -0.5  # the same where a vertex lends its light to its neighbours, whose normals differ more
 BOUNCES = 3
@@ -85,7 +86,7 @@ def _traced(
     which lamps are traced."""
     n = normals[own]
     caster = RayCaster(vertices, faces)
-    starts, order = vertices[own] + LIFT * caster.span * n, neighbours_first(vertices[own])
+    starts, order = _starts(caster, vertices, faces, own, n), neighbours_first(vertices[own])
     flux = np.zeros((len(n), len(lit.directions), 3), np.float32)
     rows: list[Indices] = []
     lamps: list[Indices] = []
@@ -108,6 +109,22 @@ def _traced(
         total = direct + np.stack(more, 1).astype(np.float32)
     flux[row, lamp] = sent
     return flux, total
+
+
+def _starts(caster: RayCaster, vertices: F32, faces: I32, own: Indices, normals: F64) -> F64:
+    """(n, 3) where rays of the vertices `own` (n,) start: above the surface. normals (n, 3).
+
+    A vertex just beneath another part of the surface, as the rim of hair and clothes beneath the skin, gets the light
+    of the place above it. No light reaches it, but its triangles come out beside it and would be dark there, and their
+    base colour, which the photos give, too bright."""
+    lift = LIFT * caster.span
+    starts = vertices[own] + lift * normals
+    far, face = caster.hits(starts, normals)
+    a, b, c = np.moveaxis(vertices[faces[face]], 1, 0)
+    leaves = (np.cross(b - a, c - a) * normals).sum(1) > 0
+    beneath = (far < BENEATH * caster.span) & leaves
+    starts[beneath] += (far[beneath, None] + lift) * normals[beneath]
+    return starts
 
 
 def _cosines(normals: F64, lit: Lamps) -> F32:

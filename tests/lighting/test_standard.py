@@ -234,3 +234,24 @@ def test_observations_of_one_vertex_share_what_arrives_and_nothing_else() -> Non
         one = slice(m, m + 1)
         np.testing.assert_array_equal(standard.lobes(at, vertex[one], normal[one], wo[one], alphas)[0], found[m])
     assert found.min() >= 0 and found.max() > 0
+
+
+@pytest.mark.parametrize(("depth", "lined", "lit_by"), [(0.005, False, 1.0), (0.2, False, 0.0), (0.005, True, 0.0)])
+def test_a_rim_beneath_the_skin_has_the_skins_light_and_the_inside_of_a_mouth_none(
+    depth: float, lined: bool, lit_by: float
+) -> None:
+    """A ball in a ball: just beneath it, deep inside, and just beneath an inner lining, as teeth behind lips."""
+    outer = ball(48, 24, 1.0)
+    v, n, f = outer["vertices"], outer["normals"], outer["faces"]
+    radius = float(np.ptp(v[:, 0])) / 2
+    middle = v.mean(0)
+    shells = [(v, n, f), (middle + (v - middle) * (1 - depth * 2), n, f)]
+    if lined:  # half-way, facing inwards
+        shells.append((middle + (v - middle) * (1 - depth), -n, f[:, ::-1]))
+    points, normals = (np.concatenate([s[k] for s in shells]).astype(np.float32) for k in (0, 1))
+    faces = np.concatenate([s[2] + i * len(v) for i, s in enumerate(shells)]).astype(np.int32)
+    lit = lamps(sky(), 64)
+    found = standard.arrivals(points, normals, faces, lit, np.zeros((len(points), 3)))
+    skin, rim = found.irradiance[: len(v)], found.irradiance[len(v) : 2 * len(v)]
+    assert radius > 0 and skin.min() > 0.1
+    np.testing.assert_allclose(rim, lit_by * skin, rtol=0.05, atol=0.02)
