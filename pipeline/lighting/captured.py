@@ -18,7 +18,7 @@ q is the least, over the three colours c, each in units of the mean of E, of
 
 The fitted light is not used itself where nothing is known. Its harmonics were found from what reaches the subject: the
 light of a window lies on half of the sphere in them, and the light behind a person whom photos show from the front is
-made up. In a room of which the truth is known the logarithm of R is off by 1.1, of the fitted light by 1.7 (person_c:
+made up. In a room of which the truth is known the logarithm of R is off by 1.0, of the fitted light by 1.7 (person_c:
 docs/benchmarks.md, Surroundings in the photos). The sum is least squares where the set of places that the maximum cuts
 is fixed: Gauss-Newton steps, with a factor against jumps of that set.
 """
