@@ -17,8 +17,8 @@ q is the least, over the three colours c, each in units of the mean of E, of
     sum_n f(n) |E_R(n) - E(n)|^2 / pi^2 + sum_i (1 + l_i^2) (TIE^2 |mean_c q_i|^2 + TIE_COLOUR^2 |q_i - mean_c q_i|^2)
 
 The fitted light is not used itself where nothing is known. Its harmonics were found from what reaches the subject: the
-light of a window lies on half of the sphere in them, and the light behind a person whom photos show from the front is
-made up. In a room of which the truth is known the logarithm of R is off by 1.0, of the fitted light by 1.7 (person_c:
+light of a window lies on half of the sphere in them, and no photo tells the light behind a person who is shown from the
+front. In a room of which the truth is known the logarithm of R is off by 1.0, of the fitted light by 1.7 (person_c:
 docs/benchmarks.md, Surroundings in the photos). The sum is least squares where the set of places that the maximum cuts
 is fixed: Gauss-Newton steps, with a factor against jumps of that set.
 """
@@ -30,12 +30,11 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 import numpy.typing as npt
-import torch
 
-from pipeline.lighting.dome import environment
+from pipeline.lighting.dome import environment, harmonics
 from pipeline.lighting.surroundings import Surroundings
 from pipeline.maths import sh
-from pipeline.maths.latlong import latlong_directions, latlong_weights
+from pipeline.maths.latlong import latlong_weights
 from pipeline.maths.smoothstep import smoothstep
 
 F32 = npt.NDArray[np.float32]
@@ -68,9 +67,8 @@ def captured_environment(light: F32, width: int, around: Surroundings | None) ->
 def irradiance_error(light: F32, image: F32, around: Surroundings) -> float:
     """Error of the picture's irradiance (H, W, 3) against the fitted light's: root mean square over the normals that
     photos see, relative to the mean of E."""
-    solid, basis = _solid(SOLVE_WIDTH), _basis(SOLVE_WIDTH, sh.ORDER)
-    facing = solid * _resized(around.facing, SOLVE_WIDTH)[:, None]
-    facing = facing / facing.sum()
+    solid, basis = _solid(SOLVE_WIDTH), harmonics(SOLVE_WIDTH, sh.ORDER)
+    facing = _facing(around)
     found = basis.T @ (solid * _resized(image, SOLVE_WIDTH))
     scale = sh.clamped_cosine(sh.ORDER).numpy()[:, None]
     wanted = basis @ (scale * _padded(light, sh.ORDER))
@@ -103,9 +101,8 @@ class _Problem:
         """None where the fitted light is not positive, so that there is no unit."""
         weights, order = _solid(SOLVE_WIDTH), max(int(np.sqrt(len(light))) - 1, LOWEST)
         wanted = _padded(light, order)
-        low, scale = _basis(SOLVE_WIDTH, order), sh.clamped_cosine(order).numpy()
-        facing = weights * _resized(around.facing, SOLVE_WIDTH)[:, None]
-        facing = facing / facing.sum()
+        low, scale = harmonics(SOLVE_WIDTH, order), sh.clamped_cosine(order).numpy()
+        facing = _facing(around)
         unit = (facing * ((low * scale) @ wanted)).sum(0) / np.pi
         if not (unit > 0).all():
             return None
@@ -157,17 +154,17 @@ def _solid(width: int) -> F64:
     return np.broadcast_to(latlong_weights(*shape[::-1]), shape).reshape(-1, 1)
 
 
+def _facing(around: Surroundings) -> F64:
+    """(pixels of SOLVE_WIDTH, 1) f times the solid angle; the sum is 1."""
+    weight = _solid(SOLVE_WIDTH) * _resized(around.facing, SOLVE_WIDTH)[:, None]
+    return np.asarray(weight / weight.sum())
+
+
 def _padded(light: F32, order: int) -> F64:
     """((order + 1)^2, 3) harmonics of a light, with 0 for those that it does not have."""
     out = np.zeros(((order + 1) ** 2, 3))
     out[: len(light)] = light[: len(out)]
     return out
-
-
-def _basis(width: int, order: int) -> F64:
-    """(pixels, (order + 1)^2) harmonics in the directions of a picture."""
-    directions = torch.from_numpy(latlong_directions(width, width // 2).reshape(-1, 3))
-    return np.asarray(sh.sh_basis(directions, order).numpy(), np.float64)
 
 
 def _far(around: Surroundings, width: int) -> F64:
@@ -183,8 +180,8 @@ def _start(around: Surroundings, median: F64, width: int) -> F64:
 
 def _full_basis(around: Surroundings, width: int) -> F64:
     """(pixels, m) the functions of q: w Y_i, and h if there are clipped places."""
-    harmonics = _far(around, width) * _basis(width, ORDER)
-    return np.concatenate([harmonics, _clipped(around, width)], 1) if around.clipped.any() else harmonics
+    smooth = _far(around, width) * harmonics(width, ORDER)
+    return np.concatenate([smooth, _clipped(around, width)], 1) if around.clipped.any() else smooth
 
 
 def _clipped(around: Surroundings, width: int) -> F64:

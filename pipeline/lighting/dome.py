@@ -57,7 +57,7 @@ def environment(light: F32, width: int) -> F32:
     """
     height = width // 2
     small = _picture(light, SOLVE_WIDTH)
-    basis, weights = _kept_basis(SOLVE_WIDTH), latlong_weights(SOLVE_WIDTH, SOLVE_WIDTH // 2)
+    basis, weights = harmonics(SOLVE_WIDTH, KEPT_ORDER), latlong_weights(SOLVE_WIDTH, SOLVE_WIDTH // 2)
     spread = np.broadcast_to(weights, small.shape[:2]).reshape(-1, 1)
     wanted = basis.T @ (spread * small.reshape(-1, 3))
     for steps in STEPS:
@@ -70,7 +70,7 @@ def environment(light: F32, width: int) -> F32:
         if _irradiance_of(left) <= FAITHFUL * _irradiance_of(wanted[:1]):
             break
     raw = _picture(light, width)
-    image = (raw + (_kept_basis(width) @ q).reshape(height, width, 3)).clip(min=0)
+    image = (raw + (harmonics(width, KEPT_ORDER) @ q).reshape(height, width, 3)).clip(min=0)
     energy, found = ((x * latlong_weights(width, height)[..., None]).sum((0, 1)) for x in (raw, image))
     return np.asarray(image * (energy.clip(min=0) / np.where(found > 0, found, 1)), np.float32)
 
@@ -88,10 +88,10 @@ def _picture(light: F32, width: int) -> F64:
     return found.reshape(width // 2, width, 3)
 
 
-def _kept_basis(width: int) -> F64:
-    """(pixels, 25) Y_lm up to KEPT_ORDER."""
+def harmonics(width: int, order: int) -> F64:
+    """(pixels, (order + 1)^2) Y_lm in the directions of a picture."""
     directions = torch.from_numpy(latlong_directions(width, width // 2).reshape(-1, 3))
-    found: F64 = sh.sh_basis(directions, KEPT_ORDER).numpy()
+    found: F64 = sh.sh_basis(directions, order).numpy()
     return found
 
 

@@ -11,7 +11,7 @@ Gaps of a few degrees, where the subject or the frame is in the way, continue th
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,10 +21,10 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from pipeline.artifacts import FittedFace, Located
+from pipeline.camera import PinholeCamera
 from pipeline.colour import srgb_from_linear
 from pipeline.maths.latlong import latlong_directions, latlong_weights
 from pipeline.maths.smoothstep import smoothstep
-from pipeline.transforms import distort
 
 F32 = npt.NDArray[np.float32]
 F64 = npt.NDArray[np.float64]
@@ -131,13 +131,13 @@ def _looked_up(photo: Backdrop, directions: F64) -> tuple[F32, Bool] | None:
     near = cv2.dilate((photo.alpha > BACKGROUND).astype(np.uint8), np.ones((2 * step + 1,) * 2, np.uint8)) > 0
     if near.all() or _painted(photo.rgb[~near]):
         return None
-    local = directions @ photo.world_from_cam[:3, :3]
-    ahead = np.flatnonzero(local[:, 2] > AHEAD)
-    uv = distort(local[ahead, :2] / local[ahead, 2:], photo.distortion) @ photo.K[:2, :2].T + photo.K[:2, 2]
-    column, row = np.floor(uv).astype(np.int64).T
-    shown = (column >= 0) & (row >= 0) & (column < width) & (row < height)
-    shown[shown] = ~near[row[shown], column[shown]]
-    ahead, column, row = ahead[shown], column[shown], row[shown]
+    turn = np.eye(4)
+    turn[:3, :3] = photo.world_from_cam[:3, :3]  # what is far away does not depend on the camera's place
+    pixel, shown = PinholeCamera(photo.K, turn, width, height, photo.distortion).pixels(directions)
+    shown &= directions @ turn[:3, 2] > AHEAD
+    shown[shown] = ~near[pixel[shown, 1], pixel[shown, 0]]
+    ahead = np.flatnonzero(shown)
+    column, row = pixel[ahead].T
     mean = _mean_around(photo.rgb, ~near, step)
     out, bright = np.full((len(directions), 3), np.nan, np.float32), np.zeros(len(directions), np.bool_)
     out[ahead] = (mean[row, column] @ np.linalg.inv(photo.response).T).clip(min=0)
@@ -180,11 +180,6 @@ def _continued(directions: F64, seen: Indices, colour: F32, bright: Bool) -> tup
     away = 2 * np.arcsin(np.minimum(chord[:, 0] / 2, 1))
     clipped = ((weight * bright[which]).sum(1) > CLIPPED) & (away < sum(REACH) / 2)
     return (weight[..., None] * colour[which]).sum(1), away, clipped
-
-
-def evenly(count: int, most: int) -> Sequence[int]:
-    """At most `most` of `count` photos, evenly over their order."""
-    return sorted({round(i) for i in np.linspace(0, count - 1, min(count, most))})
 
 
 def surroundings_of(face: Located[FittedFace]) -> Surroundings | None:

@@ -67,7 +67,7 @@ def standard_material(
 
 
 def exported_lamps(light: F32, surroundings: Surroundings | None) -> Lamps:
-    """The exported dome, whose harmonics are `light`, as lamps."""
+    """The exported dome as lamps. light: the harmonics of the fitted one."""
     return lamps(captured_environment(light, DOME_WIDTH, surroundings), COUNT)
 
 

@@ -14,10 +14,10 @@ from pipeline.colour import as_photographed
 from pipeline.contract import Context
 from pipeline.fields.face import FaceModel, FittedField
 from pipeline.images import write_exr, write_png_from_linear
-from pipeline.lighting.surroundings import Backdrop, Surroundings, evenly, surroundings
+from pipeline.lighting.surroundings import Backdrop, Surroundings, surroundings
 from stages.inverse_rendering.footprint import Footprint
 from stages.inverse_rendering.load_views import camera_only
-from stages.inverse_rendering.ray_sampling import PhotoView, factor_for, image_rays
+from stages.inverse_rendering.ray_sampling import PhotoView, evenly_spaced, factor_for, image_rays
 from stages.inverse_rendering.refine_poses import response_of
 from stages.inverse_rendering.residuals import ViewError
 from stages.inverse_rendering.systems import render_any
@@ -51,7 +51,7 @@ def write_surroundings(model: FaceModel, views: Sequence[PhotoView], context: Co
     own = [(n, v) for n, v in enumerate(views) if not v.second]
     found = surroundings(
         Backdrop(v.rgb, v.alpha, v.clipped, v.K, v.world_from_cam, v.distortion, response_of(model, n))
-        for n, v in (own[i] for i in evenly(len(own), SURROUNDED))
+        for n, v in (own[i] for i in evenly_spaced(len(own), min(len(own), SURROUNDED)))
     )
     if found is not None:
         found.save(context.workdir / SURROUNDINGS)

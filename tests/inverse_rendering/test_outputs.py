@@ -10,7 +10,7 @@ import pytest
 
 from pipeline.colour import as_photographed
 from pipeline.contract import Context
-from pipeline.lighting.surroundings import Surroundings
+from pipeline.lighting.surroundings import Backdrop, Surroundings
 from stages.inverse_rendering import outputs
 from stages.inverse_rendering.ray_sampling import PhotoView
 
@@ -51,3 +51,18 @@ def test_surroundings_are_those_of_the_first_capture_in_its_own_colours(
     elsewhere = Context(tmp_path / "none", tmp_path / "scratch")
     assert outputs.write_surroundings(None, blank, elsewhere) is None  # type: ignore[arg-type]
     assert not (tmp_path / "none" / outputs.SURROUNDINGS).exists()
+
+
+@pytest.mark.parametrize(("count", "asked"), [(0, 0), (5, 5), (1000, outputs.SURROUNDED)])
+def test_so_many_photos_are_asked_evenly(
+    count: int, asked: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[Backdrop] = []
+    monkeypatch.setattr(outputs, "response_of", lambda model, number: np.full((3, 3), number))
+    monkeypatch.setattr(outputs, "surroundings", seen.extend)
+    one = PhotoView(0, np.zeros((2, 2, 3), np.float32), np.zeros((2, 2), np.float32), np.eye(3), np.eye(4), np.zeros(5))
+    assert outputs.write_surroundings(None, [one] * count, Context(tmp_path, tmp_path)) is None  # type: ignore[arg-type]
+    numbers = np.array([b.response[0, 0] for b in seen])
+    assert len(numbers) == asked
+    if count:
+        assert numbers[0] < count / asked and numbers[-1] >= count - 1 - count / asked and np.ptp(np.diff(numbers)) <= 1

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.lighting.surroundings import Backdrop, Surroundings, evenly, surroundings
+from pipeline.lighting.surroundings import Backdrop, Surroundings, surroundings
 from pipeline.maths.latlong import latlong_directions
 from pipeline.transforms import rays
 
@@ -167,9 +167,3 @@ def test_it_is_read_as_it_was_written(tmp_path: Path) -> None:
     again = Surroundings.load(tmp_path / "x.npz")
     for name in ("radiance", "away", "clipped", "facing"):
         np.testing.assert_array_equal(getattr(found, name), getattr(again, name))
-
-
-def test_photos_are_chosen_evenly() -> None:
-    assert list(evenly(5, 10)) == [0, 1, 2, 3, 4] and list(evenly(0, 4)) == []
-    some = np.array(evenly(1000, 96))
-    assert len(some) == 96 and some[0] == 0 and some[-1] == 999 and np.ptp(np.diff(some)) <= 1
