@@ -7,6 +7,8 @@ weight are kept: one wrong mask may split the subject, and the fit can still joi
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
@@ -28,19 +30,28 @@ def subject_pieces(inside: Bool, lo: npt.ArrayLike, cell: float, least: float = 
     label, count = ndimage.label(inside)
     if count <= 1:
         return inside.copy()
-    s = SPREAD * cell * max(inside.shape)
-    square = sum(
-        np.square((low + cell * np.arange(n)) / s).reshape([-1 if a == axis else 1 for a in range(3)])
-        for axis, (low, n) in enumerate(zip(np.asarray(lo, np.float64), inside.shape, strict=True))
-    )
-    weight = np.bincount(label.ravel(), ((1.0 + square) ** -3).ravel())
+    weight = np.zeros(count + 1)
+    for places, part in zip(_distances(lo, cell, inside.shape), label, strict=True):  # by slabs: a volume may be large
+        weight += np.bincount(part.ravel(), ((1.0 + places) ** -3).ravel(), count + 1)
     weight[0] = 0.0
     return np.asarray((weight >= least * weight.max())[label])
 
 
+def _distances(lo: npt.ArrayLike, cell: float, shape: tuple[int, ...]) -> Iterator[npt.NDArray[np.float64]]:
+    """(Y, Z) for each slab: squared distances from the origin over the square of s."""
+    s = SPREAD * cell * max(shape)
+    x, y, z = (
+        np.square((low + cell * np.arange(n)) / s) for low, n in zip(np.asarray(lo, np.float64), shape, strict=True)
+    )
+    for here in x:
+        yield here + y[:, None] + z
+
+
 def filled(solid: Bool) -> Bool:
     """A volume (X, Y, Z) with filled cavities: empty space not connected to the border of the grid becomes solid."""
-    empty, _ = ndimage.label(~solid)
+    empty, count = ndimage.label(~solid)
     sides = [np.take(empty, end, axis).ravel() for axis in range(3) for end in (0, -1)]
-    border = np.unique(np.concatenate(sides))
-    return np.asarray(~np.isin(empty, border[border > 0]), np.bool_)
+    cavity = np.ones(count + 1, np.bool_)
+    cavity[np.unique(np.concatenate(sides))] = False
+    cavity[0] = True  # what is solid
+    return np.asarray(cavity[empty])

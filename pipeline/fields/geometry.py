@@ -120,11 +120,13 @@ class GridSdf(nn.Module):
         """Keep the subject's components, fill their cavities, and recompute the distances outside the band."""
         values = self.values.detach().cpu().numpy()
         solid = filled(subject_pieces(values < 0, self.lo.cpu().numpy(), self.cell))
-        far = np.where(solid, -coarse_distance(solid), coarse_distance(~solid)) * np.float32(self.cell)
-        keep = (np.abs(far) < (BAND - 1) * self.cell) & (solid == (values < 0))
-        merged = np.where(keep, values, far)
+        far = coarse_distance(~solid)  # in place, because copies of a fine grid are most of the memory of a fit
+        np.negative(coarse_distance(solid), out=far, where=solid)
+        far *= np.float32(self.cell)
+        keep = (far < (BAND - 1) * self.cell) & (far > -(BAND - 1) * self.cell) & (solid == (values < 0))
+        np.copyto(far, values, where=keep)
         with torch.no_grad():
-            self.values.copy_(torch.from_numpy(merged))
+            self.values.copy_(torch.from_numpy(far))
         self.find_band()
 
     def replace(self, values: Tensor) -> None:
@@ -198,5 +200,6 @@ def coarse_distance(free: np.ndarray) -> np.ndarray:
     x, y, z = (n // 2 for n in padded.shape)
     blocks = padded.reshape(x, 2, y, 2, z, 2).all((1, 3, 5))
     distance = 2 * ndimage.distance_transform_edt(blocks).astype(np.float32) - 2
+    np.maximum(distance, np.float32(0.5), out=distance)
     full = distance.repeat(2, 0).repeat(2, 1).repeat(2, 2)[: free.shape[0], : free.shape[1], : free.shape[2]]
-    return np.asarray(np.maximum(full, np.float32(0.5)))
+    return np.ascontiguousarray(full)
