@@ -21,9 +21,6 @@ from stages.usd.check import findings as checks
 F32 = npt.NDArray[np.float32]
 AGAINST_MODEL = Limits(28.0, 20.0)  # dB
 OVERLAP = Limits(0.97, 0.9)  # of the silhouettes, intersection over union
-# |fitted - GGX| over |fitted|, summed over texels first. What it costs in renders, where highlights may be faint, is
-# in AGAINST_MODEL.
-LOBE = Limits(1.2, np.inf, lower=False)
 FAULTS = Limits(0, 0, lower=False)
 WARNINGS = Limits(0, np.inf, lower=False)
 # A spot differs by CLEARLY of 1, sRGB-encoded, has SPOT of the subject's area, and is RIM of its size from its outline.
@@ -107,23 +104,6 @@ def spots(model: F32, asset: F32) -> int:
     differ &= ndimage.distance_transform_edt(np.pad(shown, 1))[1:-1, 1:-1] > rim
     label, count = ndimage.label(ndimage.median_filter(differ, 3))
     return int((np.bincount(label.ravel(), minlength=count + 1)[1:] > SPOT * area).sum())
-
-
-def lobe(figures: dict[str, float]) -> tuple[Finding, ...]:
-    """The finding on the error of replacing the fitted lobe by a GGX lobe. figures: of the export."""
-    if "ggx_residual" not in figures:
-        return ()
-    off = figures["ggx_residual"]
-    return (
-        judged(
-            "ggx_residual",
-            off,
-            LOBE,
-            f"the highlights of the exported shaders differ by {off:.0%} from the fitted ones",
-            "take photos under light that moves or has sharp edges, so that highlights can be separated from colour; "
-            "or use only the albedo",
-        ),
-    )
 
 
 def _compared(model: F32, asset: F32) -> tuple[float, float]:

@@ -92,7 +92,6 @@ def run(inputs: Inputs, config: Config, context: Context) -> UsdAsset:
     findings = (
         *judge.validity(found),
         *judge.against_model(_pictures(inputs, views, context)),
-        *judge.lobe(made.figures),
     )
     mark(root, verdict_of_inputs(inputs, usd=findings))
     context.progress(total, total, "done", checks=checks_run(), warnings=len(warnings))
@@ -141,4 +140,4 @@ def _refs(context: Context, files: list[Path]) -> list[FileRef]:
     return [context.file(f) for f in files]
 
 
-STAGE = Stage(name="usd", version=32, inputs=Inputs, config=Config, output=UsdAsset, run=run)
+STAGE = Stage(name="usd", version=33, inputs=Inputs, config=Config, output=UsdAsset, run=run)

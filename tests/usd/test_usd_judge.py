@@ -41,7 +41,9 @@ def test_an_asset_with_faults_is_written_and_marked(tmp_path: Path) -> None:
 
 def test_a_sound_asset_has_no_fault(exported) -> None:
     found = levels(exported[1])
-    assert found["usd_faults"] == "good" and found["usd_warnings"] == "good" and found["ggx_residual"] != ""
+    assert found["usd_faults"] == "good" and found["usd_warnings"] == "good"
+    # the shaders' lobe is fitted to the photos on its own: that it is not the field's is no fault of the asset
+    assert "ggx_residual" not in found and "ggx_residual" in exported[1].figures
     assert found["asset_against_model"] == "unusable"  # the synthetic fit's predictions are plain cards
 
 
@@ -80,13 +82,6 @@ def test_the_asset_is_compared_with_the_model() -> None:
     assert judge.against_model([("a.jpg", picture(), shifted)])[1].level == "unusable"
     assert judge.against_model([("a.jpg", picture(), np.zeros_like(picture()))])[1].value == 0
     assert judge.against_model([]) == ()
-
-
-@pytest.mark.parametrize("residual, level", [(0.0, "good"), (0.94, "good"), (2.02, "usable"), (109.6, "usable")])
-def test_lobes_that_no_shader_shows_are_told(residual: float, level: str) -> None:
-    (found,) = judge.lobe({"ggx_residual": residual})
-    assert found.level == level and f"{residual:.0%}" in found.said
-    assert judge.lobe({}) == ()
 
 
 def face(spot: float = 0.0, radius: float = 60.0) -> np.ndarray:
