@@ -16,6 +16,7 @@ PARTS, COMPLETE = "tests/pipeline/test_needed_parts.py", "tests/masks/test_compl
 NEEDS, EXTENT = "tests/pipeline/test_hull_needs.py", "tests/masks/test_masks_extent.py"
 FLOW = "tests/inverse_rendering/test_depth_from_flow.py"
 BEYOND, SPOTS = "tests/masks/test_beyond_hull.py", "tests/usd/test_usd_judge.py"
+VOTES = "tests/masks/test_hull_votes.py"
 IMAGES, RENDER = "tests/core/test_images.py", "tests/usd/test_usd_render.py"
 
 OF_CAMERAS = (
@@ -51,12 +52,33 @@ OF_CAMERAS = (
              f"{BEYOND}::test_a_region_with_the_subjects_colours_stays_because_the_hull_may_lack_it"),
     Mutation("stages/masks/beyond_hull.py", "rather > np.where(part, -OWN, 0)", "rather > -100",
              f"{BEYOND}::test_between_a_region_and_the_hulls_outline_each_pixel_is_decided_alone"),
-    Mutation("stages/masks/beyond_hull.py", "eroded(silhouette & inside, 2 * margin)", "inside",
-             f"{BEYOND}::test_a_region_beyond_the_hull_with_the_walls_colours_is_background"),
     Mutation("stages/masks/beyond_hull.py", "np.where(zone, np.minimum(", "np.where(zone | True, np.minimum(",
              f"{BEYOND}::test_alpha_changes_only_where_background_was_found"),
-    Mutation("stages/masks/beyond_hull.py", "list(compress(alphas, votes))", "list(alphas)",
-             f"{BEYOND}::test_the_hull_is_that_of_all_voting_masks"),
+    Mutation("stages/masks/beyond_hull.py", "found |= _smooth(part | (rather > 0))", "found |= _smooth(rather > 0)",
+             f"{BEYOND}::test_what_many_photos_contradict_is_background_whatever_it_looks_like"),
+    Mutation("stages/masks/beyond_hull.py", ".max() >= THICK", ".max() >= 0 * THICK",
+             f"{BEYOND}::test_only_a_large_and_thick_region_is_surely_background"),
+    Mutation("stages/masks/beyond_hull.py", "LARGE * inside.sum())", "0.0)",
+             f"{BEYOND}::test_only_a_large_and_thick_region_is_surely_background"),
+    Mutation("stages/masks/beyond_hull.py", ">= MANY]", ">= 0]",
+             f"{BEYOND}::test_what_many_photos_contradict_is_background_whatever_it_looks_like"),
+    # ---------------------------------------------------------------- how many photos contradict a pixel
+    Mutation("stages/masks/hull_votes_kernels.py", "max(against - forgiven, 0) / seen", "against / seen",
+             f"{VOTES}::test_its_own_mask_has_no_vote_and_one_wrong_mask_is_forgiven"),
+    Mutation("stages/masks/hull_votes_kernels.py", "        if v == skip:", "        if v == -2:",
+             f"{VOTES}::test_its_own_mask_has_no_vote_and_one_wrong_mask_is_forgiven"),
+    Mutation("stages/masks/hull_votes_kernels.py", "if seen < fewest:", "if seen < 1:",
+             f"{VOTES}::test_what_few_frames_show_is_not_known"),
+    Mutation("stages/masks/hull_votes_kernels.py", "view[21] * (r2 + 2 * a * a)", "view[20] * (r2 + 2 * a * a)",
+             f"{VOTES}::test_shares_are_those_of_a_plain_loop"),
+    Mutation("stages/masks/hull_votes_kernels.py", "z < plane[3]", "z < -9.0",
+             f"{VOTES}::test_what_lies_beneath_the_support_is_not_the_subjects"),
+    Mutation("stages/masks/hull_votes_kernels.py", "known = abs(along - middle) <= inner", "known = True",
+             f"{VOTES}::test_shares_are_those_of_a_plain_loop"),
+    Mutation("stages/masks/hull_votes.py", "np.flatnonzero(voting)", "range(len(voting))",
+             f"{VOTES}::test_its_own_mask_has_no_vote_and_one_wrong_mask_is_forgiven"),
+    Mutation("stages/masks/hull_votes.py", "camera.width / where.shape[1]", "1.0",
+             f"{VOTES}::test_directions_of_a_photo_are_those_of_its_pixels"),
     Mutation("stages/masks/segment.py", "if name not in COMPUTED or m.useless:", "if m.useless:",
              f"{BEYOND}::test_given_masks_are_not_cut"),
     # ---------------------------------------------------------------- spots of an asset

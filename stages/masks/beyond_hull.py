@@ -1,33 +1,28 @@
 """Background that a mask took for the subject, as the other masks show it.
 
-A ray beyond the visual hull of all masks meets no place that each of them calls the subject: the wall between a chin
-and a chest, a part of the turntable. The hull errs too: what one mask lacks, it lacks in every view. So the colours
-must agree. A region beyond the hull is cut off where its mean of
+What lies beyond the visual hull (hull_votes: no place on a pixel's ray is the subject's in the other photos) is the
+wall between a chin and a chest, or a part of the turntable. The hull errs too: what some masks lack, it lacks in every
+view. So a thick part that many photos contradict is cut off whatever it looks like, and of the rest the colours have
+the last word. A region is cut off where its mean of
 
     min(d_in^2 / 2, MOST) - min(d_out^2 / 2, MOST)
 
 is above 0: it is more like the background next to it than like the subject next to it. Where the colours are alike, the
 background is nearer, so that the hull is believed. d: stages.masks.refine_contour, against samples of the mask deep
 inside of the hull (d_in) and of what is outside of the mask (d_out). In such a region a pixel stays if it is clearly
-the subject's (below -OWN); between it and the hull's outline, if it is not above 0. Accuracy: docs/captures.md,
-Contours.
+the subject's (below -OWN). Within RIM of a region, up to the hull's outline, a pixel stays if it is not above 0.
+Accuracy: docs/captures.md, Contours.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from itertools import compress
-
 import cv2
 import numpy as np
 
-from pipeline.artifacts import Camera
-from pipeline.hull import Cloud, cloud, render_silhouette, visual_hull
 from pipeline.hull_needs import regions
-from pipeline.support import Support
-from stages.masks.hull_consistency import CUBE, POSSIBLE, above
+from stages.masks.hull_votes import DOUBT
 from stages.masks.refine_contour import BLUR, FEWEST, unlike
-from stages.masks.region import F32, U8, Bool, Disc, dilated, eroded
+from stages.masks.region import F32, U8, Bool, dilated, eroded
 from stages.masks.sources import to_full_size
 
 LEAST = 0.0005  # of a mask: smaller regions are noise of its outline
@@ -35,47 +30,44 @@ SPREAD, NEAR, MOST = 16.0, 40 / 640, 6.0  # s of 255, r of the longest edge, and
 AROUND = 60 / 640  # of the longest edge: how far from a region its neighbours are
 OWN = 1.0  # by which a pixel of a region that is cut off must be more like the subject to stay
 CLEAR = 2  # pixels outside of the mask's outline where samples of the background begin
+RIM, DEEP = 3 / 640, 8 / 640  # of the longest edge: around a region; inside of the hull, where samples begin
+# colours don't count from: a region's share of the mask, its thickness (of the longest edge), share of the photos
+LARGE, THICK, MANY = 0.002, 7 / 640, 0.12
+MOSTLY = 90  # percentile of a region's shares that is compared with MANY
 
 
-def strict_hull(
-    cameras: Sequence[Camera], alphas: Sequence[F32], votes: Sequence[bool], roi_radius: float, cells: int,
-    support: Support | None,
-) -> Cloud:  # fmt: skip
-    """The hull of what all voting masks call the subject or do not see. alphas: (h, w) each.
-    cells: voxels per edge of the cube. support: the subject is above this plane."""
-    edge = CUBE * roi_radius
-    hull = visual_hull(list(compress(cameras, votes)), list(compress(alphas, votes)), [-edge] * 3, [edge] * 3,
-                       2 * edge / cells, min_views=0)  # fmt: skip
-    return cloud(above(support, hull))
+def beyond(inside: Bool, outer: Bool) -> list[Bool]:
+    """Regions (h, w) of a mask among its pixels `outer` (h, w) beyond the hull, without thin lines."""
+    return regions(dilated(eroded(inside & outer, 1), 1), LEAST * inside.sum())
 
 
-def limits(hull: Cloud, camera: Camera, disc: Disc, roi_radius: float, shape: tuple[int, int]) -> tuple[Bool, int]:
-    """The hull's silhouette (h, w), with all where the hull was not carved, and a voxel in pixels of it. disc: the
-    region of interest at this size. shape: h, w."""
-    silhouette = render_silhouette(hull, camera, *shape) >= 0.5
-    return silhouette | ~disc.covers(*shape, POSSIBLE), max(1, round(disc.radius * hull.cell / roi_radius))
+def surely(inside: Bool, share: F32) -> list[Bool]:
+    """Regions (h, w) of a mask that are background whatever they look like: large, thick, and contradicted by many
+    photos. share (h, w): hull_votes.contradicting."""
+    return [r for r in regions(dilated(eroded(inside & (share > DOUBT), 1), 1), LARGE * inside.sum())
+            if 2 * cv2.distanceTransform(r.astype(np.uint8), cv2.DIST_L2, 5).max() >= THICK * max(r.shape)
+            and np.percentile(share[r], MOSTLY) >= MANY]  # fmt: skip
 
 
-def beyond(inside: Bool, silhouette: Bool, margin: int) -> list[Bool]:
-    """Regions (h, w) of a mask that are more than `margin` pixels outside of a silhouette, all (h, w)."""
-    return regions(inside & ~dilated(silhouette, margin), LEAST * inside.sum())
-
-
-def background(image: U8, inside: Bool, silhouette: Bool, margin: int) -> Bool:
-    """Pixels (h, w) of a mask that are background: beyond the silhouette, and of the background's colours. image:
-    (h, w, 3) 8-bit sRGB. inside, silhouette: (h, w). margin: pixels by which the silhouette may be too small."""
+def background(image: U8, inside: Bool, outer: Bool, share: F32) -> Bool:
+    """Pixels (h, w) of a mask that are background. image: (h, w, 3) 8-bit sRGB. inside: (h, w). outer (h, w):
+    hull_votes.beyond_all; share (h, w): hull_votes.contradicting."""
     found = np.zeros_like(inside)
-    parts = beyond(inside, silhouette, margin)
+    parts = beyond(inside, outer)
     if not parts:
         return found
+    longest = max(inside.shape)
     seen = np.asarray(cv2.GaussianBlur(image.astype(np.float32), (0, 0), BLUR), np.float32)
-    deep, outer = eroded(silhouette & inside, 2 * margin), eroded(~inside, CLEAR)
-    if not (deep.any() and outer.any()):
+    deep, around = eroded(inside & ~outer, max(2, round(DEEP * longest))), eroded(~inside, CLEAR)
+    if not (deep.any() and around.any()):
         return found
-    for part in parts:
-        ring = dilated(part, 2 * margin) & inside & ~silhouette
-        rather = _rather_background(seen, ring, _next_to(part, deep), _next_to(part, outer))
-        if float(rather[part].mean()) > 0:
+    sure = surely(inside, share)
+    for part in (*sure, *parts):
+        ring = dilated(part, max(1, round(RIM * longest))) & inside
+        rather = _rather_background(seen, ring, _next_to(part, deep), _next_to(part, around))
+        if any(part is s for s in sure):
+            found |= _smooth(part | (rather > 0))
+        elif float(rather[part].mean()) > 0:
             found |= ring & _smooth(rather > np.where(part, -OWN, 0))
     return found
 

@@ -22,7 +22,6 @@ from pipeline.extent import head_extent
 from pipeline.faces.find import Face
 from pipeline.faces.labels import LABELS
 from pipeline.faces.landmarks3d import head_frame
-from pipeline.hull import Cloud
 from pipeline.images import read_alpha, write_png
 from pipeline.meshes import F64
 from pipeline.needed_parts import needed_parts
@@ -33,7 +32,8 @@ from stages.masks.config import Config
 from stages.masks.extent import MAX_OPEN, asked, cut_by_head, kept_whole, outline_points, whole_hull
 from stages.masks.face_labels import labels_with, subjects_face
 from stages.masks.grabcut import cut
-from stages.masks.hull_consistency import Opinion, contradiction, hole, lacking, opinions, outliers, trimap
+from stages.masks.hull_consistency import POSSIBLE, Opinion, contradiction, hole, lacking, opinions, outliers, trimap
+from stages.masks.hull_votes import Votes, beyond_all, contradicting, votes_of
 from stages.masks.judge import Seen, extent_finding, judge, open_share
 from stages.masks.landmarks import agreed, save_landmarks
 from stages.masks.photos import at_once, photos_of
@@ -48,7 +48,6 @@ MIN_AGREEMENT = 0.8  # smallest IoU of a mask and the hull of all masks, in the 
 MAX_DEVIATION = 0.05  # IoU below the median from which a mask may be an outlier
 LIMITS = 0.001, 0.999  # mean alpha of a mask that is neither empty nor full
 SMALL = 512  # pixels, longest edge of the masks for the consistency check
-FINER = 2  # voxels of the hull that limits the masks, per voxel of the hull that is compared with them
 CONTRADICTED = 0.007  # share of a mask's area from which the view is segmented again
 HOLE = 0.001  # the same for a hole: one in a single mask makes a tunnel through the subject
 FEWEST = 3  # views that must remain
@@ -119,7 +118,7 @@ def segment(
         bad = [a or _wrong_held_out(m) for a, m in zip(_outliers(masked), masked, strict=True)]
         corrected = _each(lambda t: _segment_again(t[0], t[1], t[2], config, context),
                           list(zip(masked, found, bad, strict=True)), threads, context, "checking masks")  # fmt: skip
-        corrected = _without_background(corrected, poses.roi_radius, config, support, threads, context)
+        corrected = _without_background(corrected, poses.roi_radius, support, threads, context)
         if any(a is not b for a, b in zip(corrected, masked, strict=True)):
             voting = [not m.view.holdout and not m.useless for m in corrected]
             found = _opinions(corrected, voting, poses, config, support)
@@ -301,31 +300,34 @@ def _segment_again(made: Masked, opinion: Opinion, bad: bool, config: Config, co
 
 
 def _without_background(
-    masked: list[Masked], roi_radius: float, config: Config, support: Support | None, threads: int, context: Context
+    masked: list[Masked], roi_radius: float, support: Support | None, threads: int, context: Context
 ) -> list[Masked]:
-    """The masks without what lies beyond the hull of all and has the background's colours; see beyond_hull."""
-    votes = [not m.view.holdout and not m.useless for m in masked]
-    hull = beyond_hull.strict_hull([m.camera for m in masked], [m.carving for m in masked], votes, roi_radius,
-                                   FINER * config.hull_cells, support)  # fmt: skip
-    return _each(partial(_cut, hull, roi_radius, context), masked, threads, context, "cutting off background")
+    """The masks without what lies beyond the hull of all and is background; see beyond_hull."""
+    voting = [not m.view.holdout and not m.useless for m in masked]
+    votes = votes_of([m.camera for m in masked], [m.carving for m in masked], voting)
+    return _each(partial(_cut, votes, roi_radius, support, context), list(enumerate(masked)), threads, context,
+                 "cutting off background")  # fmt: skip
 
 
-def _cut(hull: Cloud, roi_radius: float, context: Context, m: Masked) -> Masked:
+def _cut(
+    votes: Votes, roi_radius: float, support: Support | None, context: Context, item: tuple[int, Masked]
+) -> Masked:
     """The view's mask without the background beyond the hull; unchanged if there is none, or if the user gave it."""
+    number, m = item
     name = m.source.removesuffix(BY_HULL)
     if name not in COMPUTED or m.useless:
         return m
-    disc, width = m.view.disc, m.camera.width
-
-    def limits(shape: tuple[int, int]) -> tuple[Bool, int]:
-        return beyond_hull.limits(hull, m.camera, disc.scaled(shape[1] / width), roi_radius, shape)
-
-    if not beyond_hull.beyond(m.small >= 0.5, *limits((m.small.shape[0], m.small.shape[1]))):
+    h, w = m.small.shape
+    here = m.view.disc.scaled(w / m.camera.width).covers(h, w, POSSIBLE)
+    outer = beyond_all(votes, number, m.camera, (m.small >= 0.5) & here, roi_radius, support)
+    if not beyond_hull.beyond(m.small >= 0.5, outer):
         return m
+    share = contradicting(votes, number, m.camera, outer, roi_radius, support)
     image = m.view.read()
     w, h = working_size(image.shape[1], image.shape[0], WORKING_SIZE)
-    inside = np.asarray(resized(m.small, w, h)) >= 0.5
-    found = beyond_hull.background(np.asarray(resized(image, w, h), np.uint8), inside, *limits((h, w)))
+    inside, beyond = (np.asarray(resized(x.astype(np.float32), w, h)) >= 0.5 for x in (m.small, outer))
+    small = np.asarray(resized(image, w, h), np.uint8)
+    found = beyond_hull.background(small, inside, beyond, np.asarray(resized(share, w, h), np.float32))
     if not found.any() or (inside & ~found).mean() < LIMITS[0]:
         return m
     alpha = beyond_hull.cut(read_alpha(_path(m.view.index, context)), image, inside, found)
