@@ -218,9 +218,11 @@ def _known(field: Field, fill: Filler, around: F32) -> Known:
 
 
 def _believed(known: Known, field: Field, fill: Filler, fitted: Fitted | None) -> tuple[Known, Fitted | None]:
-    """Both with the colours that few photos show and no other place has (odd_colours.py) replaced."""
+    """Both with the colours replaced that few photos show, and no other place has or these photos contradict
+    (odd_colours.py)."""
     own = field.material(fill.mesh.vertices).albedo.astype(np.float64)
-    doubt = doubted(fill.mesh, own if fitted is None else own * fitted.correction, fill.region, fill.sight)
+    shown = own if fitted is None else own * fitted.correction
+    doubt = doubted(fill.mesh, shown, fill.region, fill.sight, None if fitted is None else fitted.apart)
     if not doubt.any():
         return known, fitted
     replaced, albedo = fill(own, doubt)

@@ -1,19 +1,23 @@
-"""Colours that hardly any photo shows and that the rest of the head does not have.
+"""Colours that hardly any photo shows, and that the rest of the head does not have or that these photos contradict.
 
 At the border of what photos see, under hair, behind a neck, a place is in one or two of them, and these may show
 something else there: the wall, hair in front, surface that lies elsewhere. The place then takes a colour that the
 person has nowhere. Places that many photos show, and colours that occur elsewhere, are believed. Things without a head
 may have a colour in one place only, so that nothing of them is doubted.
 
-    doubt = p U / (p U + (1 - p) f(x))        p = WRONG^k
+    doubt = the larger of p U / (p U + (1 - p) f(x)) and p R(m) / (p R(m) + 1 - p)        p = WRONG^k
+    R(m) = (RIGHT / WIDE) exp(m / RIGHT - m / WIDE)
 
 and where the mean doubt of such places nearby, weighted by p over NEAR, is larger, that: what few photos show wrongly
-is a patch, and parts of it have a usual colour.
+is a patch, and parts of it have a usual colour. Contradictions spread over TORN where most of what is around has them.
 
 Symbols: x of a vertex: log luminance of its colour, and the logs of red and of blue over the luminance; k number of
 photos that see it, of those at grazing angles a part, times USUAL / median where the median of the seen vertices is
 lower; U density of a wrong colour, the same for all; f density of right colours: kernel estimate (Gaussians of the
-widths WIDTH) over well seen vertices, OWN of it over those of the same region of the head, the rest over all.
+widths WIDTH) over well seen vertices, OWN of it over those of the same region of the head, the rest over all; m: how
+far the photos are apart (below), whose density is exponential, of the mean RIGHT for a place that is where the photos
+see it, and WIDE for one that is not. Two photos of the wall and of hair are apart, and both may have colours of the
+shirt.
 """
 
 from __future__ import annotations
@@ -37,13 +41,16 @@ SAMPLES, ENOUGH = 400, 50  # vertices that stand for a region; with fewer it has
 MOST = 0.7, 0.3  # doubt from which a colour is replaced, and up to which it is kept
 LEAST = 1e-3  # linear: darker colours count as that
 NEAR = 0.005  # metres: standard deviation of the mean
+# metres; a back that few photos show is torn as a whole from this share on: an eye's corner has well seen skin around
+TORN, ALL = 0.02, 2 / 3
 BLOCK = 4096  # vertices at once: 13 MB
+RIGHT, WIDE, FARTHEST = 0.1, 0.5, 1.5  # nine in ten well seen vertices of people are up to .2 apart
 BELIEVED = 12.0  # k from which the doubt is left out: p is .0002
 
 
-def doubted(mesh: Mesh, colour: F64, region: Indices, sight: Sight) -> F64:
+def doubted(mesh: Mesh, colour: F64, region: Indices, sight: Sight, apart: F64 | None = None) -> F64:
     """(V,) how far the colours (V, 3), linear, of vertices in regions (V,) are to be replaced, in [0, 1]; 0 where no
-    photo sees a vertex."""
+    photo sees a vertex. apart (V,): m, NaN where it is not known; None: nowhere."""
     seen = sight.photos > 0
     out = np.zeros(len(colour))
     if not seen.any():
@@ -57,10 +64,40 @@ def doubted(mesh: Mesh, colour: F64, region: Indices, sight: Sight) -> F64:
         asked = np.flatnonzero(few & (region == code))
         f = _density(x[asked], x, well, well & (region == code))
         out[asked] = p[asked] * UNIFORM / (p[asked] * UNIFORM + (1 - p[asked]) * f)
+    if apart is not None:
+        out = np.maximum(out, _contradicted(mesh, p, np.where(seen, apart, np.nan)))
     if out.max() > MOST[1]:
         nearby = Smoother(mesh, NEAR).mean(out[:, None], p)[:, 0]
         out[few] = np.maximum(out, nearby)[few]
     return smoothstep(out, MOST[1], MOST[0])
+
+
+def _contradicted(mesh: Mesh, p: F64, apart: F64) -> F64:
+    """The doubt (V,) of places with p (V,) whose photos are apart (V,), and of all such places where they are many."""
+    told = np.isfinite(apart)
+    m = np.minimum(np.where(told, apart, 0.0), FARTHEST)
+    wide = p * RIGHT / WIDE * np.exp(m / RIGHT - m / WIDE)
+    out: F64 = np.where(told, wide / (wide + 1 - p), 0.0)
+    if out.max() > MOST[1]:
+        around = Smoother(mesh, TORN).mean(out[:, None], told.astype(np.float64))[:, 0]
+        out = np.where(p > 0, np.maximum(out, around / ALL), 0.0)
+    return out
+
+
+def apart(vertex: Indices, colour: F64, predicted: F64, count: int) -> F64:
+    """m (V,) of `count` vertices: the median over the photos of |log Y - log Y'|, NaN with fewer than two photos.
+
+    Y: luminance of the colour (M, 3) in a photo, Y' of the predicted one (M, 3); vertex (M,): which vertex each is of.
+    """
+    y, expected = (np.log(np.maximum(c @ np.array(LUMA), LEAST)) for c in (colour, predicted))
+    off = np.abs(y - expected)
+    ranked = off[np.lexsort((off, vertex))]
+    photos = np.bincount(vertex, minlength=count)
+    first = np.cumsum(photos) - photos
+    out, told = np.full(count, np.nan), photos > 1
+    low, high = (first[told] + (photos[told] - 1) // 2), (first[told] + photos[told] // 2)
+    out[told] = 0.5 * (ranked[low] + ranked[high])
+    return out
 
 
 def _logs(colour: F64) -> F64:

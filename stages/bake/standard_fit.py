@@ -103,7 +103,7 @@ OBJECT = replace(REST, assumed=ASSUMED_F0)  # a capture without a person
 class Fitted:
     """At the vertices: correction (V, 3) of the albedo, f0 (V,), roughness (V,); received (V, 3): S. figures: for the
     report. plausible: false if the only material is none that exists. measured (V, 2): share of the photos in F0 and in
-    roughness (sources.py)."""
+    roughness (sources.py). apart (V,): how far the photos are apart (odd_colours.py), NaN where it is not known."""
 
     correction: F32
     f0: F32
@@ -112,6 +112,7 @@ class Fitted:
     figures: dict[str, float]
     plausible: bool = True
     measured: F32 = field(default_factory=lambda: np.zeros((0, 2), np.float32))
+    apart: F64 | None = None
 
 
 @dataclass(frozen=True, slots=True)

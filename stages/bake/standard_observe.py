@@ -25,6 +25,7 @@ from stages.bake import standard_fit
 from stages.bake.detail import Detail, shade
 from stages.bake.detail_views import Photos
 from stages.bake.even_skin import Even
+from stages.bake.odd_colours import apart
 from stages.bake.regions import Poll
 from stages.bake.skin import skin_of
 from stages.bake.standard_seen import Lit, Seen
@@ -57,12 +58,13 @@ def standard_material(
         poses = [matrix(v.camera.world_from_cam) for v in views]
         at = carried(moving, field.light, mesh, normals, observations, view, poses, check)
     out = standard_fit.fit(mesh, normals, at, albedo, observations, skin, check, hair, asked)
+    off = apart(observations.vertex, observations.colour, observations.predicted, len(mesh.vertices))
     correction = continued(mesh, out.correction.astype(np.float64), seen)
     if even is None:
-        return replace(out, correction=correction.astype(np.float32))
+        return replace(out, correction=correction.astype(np.float32), apart=off)
     evened = even(skin & seen, albedo * correction)
     return replace(
-        out, correction=(correction * evened.factor).astype(np.float32), figures=out.figures | evened.figures
+        out, correction=(correction * evened.factor).astype(np.float32), figures=out.figures | evened.figures, apart=off
     )
 
 

@@ -10,7 +10,19 @@ from pipeline.meshes import F32, F64, Indices, Mesh
 from pipeline.visibility import FittedPhoto, Sight
 from stages.bake.build import Baker, _believed, _known
 from stages.bake.filling import Filler
-from stages.bake.odd_colours import MOST, UNIFORM, WIDTH, WRONG, _kernels, doubted
+from stages.bake.odd_colours import (
+    FARTHEST,
+    LEAST,
+    MOST,
+    RIGHT,
+    UNIFORM,
+    WIDE,
+    WIDTH,
+    WRONG,
+    _kernels,
+    apart,
+    doubted,
+)
 from stages.bake.standard_fit import Fitted
 from stages.surface.build import build as surface_build
 from stages.uv.config import Config
@@ -102,6 +114,67 @@ def test_a_patch_goes_as_a_whole() -> None:
     assert doubted(MESH, spotted, ONE, sight(1.0))[spots].min() > 0.9
 
 
+# ------------------------------------------------------------------ photos that contradict each other
+def test_a_usual_colour_is_doubted_where_two_photos_contradict_each_other() -> None:
+    plain, off = colours(SKIN), np.where(PATCH, 0.6, 0.05)
+    assert (doubted(MESH, plain, ONE, sight(2.0), off)[PATCH] > 0.9).all()
+    assert (doubted(MESH, plain, ONE, sight(2.0), np.full(len(X), 0.05)) == 0).all()
+    assert (doubted(MESH, plain, ONE, sight(20.0), off) == 0).all()
+    unknown = np.full(len(X), np.nan)
+    assert (doubted(MESH, plain, ONE, sight(2.0), unknown) == doubted(MESH, plain, ONE, sight(2.0))).all()
+
+
+def test_a_torn_back_goes_as_a_whole_and_a_small_corner_does_not() -> None:
+    """Every second vertex is in one photo, which nothing contradicts."""
+    plain, pair = colours(SKIN), np.arange(len(X)) % 2 == 0
+
+    def gone(half: float) -> F64:
+        back = abs(X - 0.1) < half
+        few = Sight(np.full(len(X), 0.9), np.where(back, np.where(pair, 2.0, 1.0), 20.0))
+        off = np.where(back, np.where(pair, 0.6, np.nan), 0.05)
+        return doubted(MESH, plain, ONE, few, off)[(abs(X - 0.1) < 0.9 * half) & ~pair]
+
+    assert gone(0.04).min() > 0.9
+    assert gone(0.0006).max(initial=0) < 0.1
+
+
+def test_the_formula_of_contradicting_photos() -> None:
+    """As the probability that m is of the wide one of two exponential densities."""
+    from scipy import stats
+
+    at, k, m = int(np.flatnonzero(PATCH)[5]), 3.0, 0.42
+    few = Sight(np.full(len(X), 0.9), np.where(np.arange(len(X)) == at, k, 20.0))
+    p = WRONG**k
+    wrong, right = (stats.expon.pdf(m, scale=s) for s in (WIDE, RIGHT))
+    doubt = p * wrong / (p * wrong + (1 - p) * right)
+    t = np.clip((doubt - MOST[1]) / (MOST[0] - MOST[1]), 0, 1)
+    assert 0.02 < t < 0.98
+    found = doubted(MESH, np.tile(SKIN, (len(X), 1)), ONE, few, np.where(np.arange(len(X)) == at, m, 0.02))
+    assert found[at] == pytest.approx(t * t * (3 - 2 * t), rel=1e-3)
+
+
+def test_how_far_photos_are_apart_is_the_median_of_their_errors() -> None:
+    rng = np.random.default_rng(2)
+    vertex = rng.integers(0, 40, 300)
+    vertex = np.concatenate([vertex[vertex != 7], [41]])
+    colour, predicted = rng.uniform(0.01, 1, (2, len(vertex), 3))
+    found = apart(vertex, colour, predicted, 43)
+    y = np.array([0.2126, 0.7152, 0.0722])
+    for v in range(43):
+        off = np.abs(np.log(colour @ y) - np.log(predicted @ y))[vertex == v]
+        assert np.isnan(found[v]) if len(off) < 2 else found[v] == pytest.approx(np.median(off), rel=1e-9)
+    assert np.isnan(found[[7, 41, 42]]).all()
+
+
+@pytest.mark.parametrize("value", [0.0, 1e-30, 1e30])
+def test_black_and_very_bright_colours_are_a_finite_way_apart(value: float) -> None:
+    vertex, dark = np.array([0, 0, 0]), np.zeros((3, 3))
+    found = apart(vertex, np.full((3, 3), value), dark, 1)
+    assert found[0] == pytest.approx(max(np.log(max(value, LEAST) / LEAST), 0))
+    doubt = doubted(MESH, colours(SKIN), ONE, sight(2.0), np.where(PATCH, 10 * FARTHEST, 0.0))
+    assert np.isfinite(doubt).all() and doubt.max() == 1
+
+
 def test_extremes() -> None:
     unseen = Sight(np.zeros(len(X)), np.zeros(len(X)))
     assert (doubted(MESH, colours(), ONE, unseen) == 0).all()
@@ -161,7 +234,7 @@ def test_the_correction_goes_with_the_colour(fitted: bool) -> None:
 def test_things_without_a_head_are_believed(monkeypatch: pytest.MonkeyPatch) -> None:
     asked = []
 
-    def all_of_it(mesh: Mesh, colour: F64, region: Indices, sight: Sight) -> F64:
+    def all_of_it(mesh: Mesh, colour: F64, region: Indices, sight: Sight, apart: F64 | None) -> F64:
         asked.append(len(region))
         return np.zeros(len(colour))
 
