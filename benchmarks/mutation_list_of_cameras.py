@@ -60,7 +60,9 @@ OF_CAMERAS = (
              f"{BEYOND}::test_only_a_large_and_thick_region_is_surely_background"),
     Mutation("stages/masks/beyond_hull.py", "LARGE * inside.sum())", "0.0)",
              f"{BEYOND}::test_only_a_large_and_thick_region_is_surely_background"),
-    Mutation("stages/masks/beyond_hull.py", ">= MANY]", ">= 0]",
+    Mutation("stages/masks/beyond_hull.py", "max(MANY, AGAINST / max(voters, 1))", "MANY",
+             f"{BEYOND}::test_of_few_photos_three_must_contradict"),
+    Mutation("stages/masks/beyond_hull.py", ">= enough]", ">= 0]",
              f"{BEYOND}::test_what_many_photos_contradict_is_background_whatever_it_looks_like"),
     # ---------------------------------------------------------------- how many photos contradict a pixel
     Mutation("stages/masks/hull_votes_kernels.py", "max(against - forgiven, 0) / seen", "against / seen",

@@ -33,7 +33,8 @@ CLEAR = 2  # pixels outside of the mask's outline where samples of the backgroun
 RIM, DEEP = 3 / 640, 8 / 640  # of the longest edge: around a region; inside of the hull, where samples begin
 # colours don't count from: a region's share of the mask, its thickness (of the longest edge), share of the photos
 LARGE, THICK, MANY = 0.002, 7 / 640, 0.12
-MOSTLY = 90  # percentile of a region's shares that is compared with MANY
+MOSTLY = 90  # percentile of a region's shares that is compared with that
+AGAINST = 2.0  # photos, besides the one that may be wrong (hull_votes.FORGIVEN)
 
 
 def beyond(inside: Bool, outer: Bool) -> list[Bool]:
@@ -41,17 +42,23 @@ def beyond(inside: Bool, outer: Bool) -> list[Bool]:
     return regions(dilated(eroded(inside & outer, 1), 1), LEAST * inside.sum())
 
 
-def surely(inside: Bool, share: F32) -> list[Bool]:
-    """Regions (h, w) of a mask that are background whatever they look like: large, thick, and contradicted by many
-    photos. share (h, w): hull_votes.contradicting."""
+def many(voters: int) -> float:
+    """The share of `voters` photos from which they are many: MANY, and AGAINST of them, because of eight photos two may
+    have the same wrong mask."""
+    return max(MANY, AGAINST / max(voters, 1))
+
+
+def surely(inside: Bool, share: F32, enough: float) -> list[Bool]:
+    """Regions (h, w) of a mask that are background whatever they look like: large, thick, and contradicted by `enough`
+    of the photos (many). share (h, w): hull_votes.contradicting."""
     return [r for r in regions(dilated(eroded(inside & (share > DOUBT), 1), 1), LARGE * inside.sum())
             if 2 * cv2.distanceTransform(r.astype(np.uint8), cv2.DIST_L2, 5).max() >= THICK * max(r.shape)
-            and np.percentile(share[r], MOSTLY) >= MANY]  # fmt: skip
+            and np.percentile(share[r], MOSTLY) >= enough]  # fmt: skip
 
 
-def background(image: U8, inside: Bool, outer: Bool, share: F32) -> Bool:
+def background(image: U8, inside: Bool, outer: Bool, share: F32, enough: float = MANY) -> Bool:
     """Pixels (h, w) of a mask that are background. image: (h, w, 3) 8-bit sRGB. inside: (h, w). outer (h, w):
-    hull_votes.beyond_all; share (h, w): hull_votes.contradicting."""
+    hull_votes.beyond_all; share (h, w): hull_votes.contradicting; enough: of it (many)."""
     found = np.zeros_like(inside)
     parts = beyond(inside, outer)
     if not parts:
@@ -61,7 +68,7 @@ def background(image: U8, inside: Bool, outer: Bool, share: F32) -> Bool:
     deep, around = eroded(inside & ~outer, max(2, round(DEEP * longest))), eroded(~inside, CLEAR)
     if not (deep.any() and around.any()):
         return found
-    sure = surely(inside, share)
+    sure = surely(inside, share, enough)
     for part in (*sure, *parts):
         ring = dilated(part, max(1, round(RIM * longest))) & inside
         rather = _rather_background(seen, ring, _next_to(part, deep), _next_to(part, around))

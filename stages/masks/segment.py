@@ -327,7 +327,8 @@ def _cut(
     w, h = working_size(image.shape[1], image.shape[0], WORKING_SIZE)
     inside, beyond = (np.asarray(resized(x.astype(np.float32), w, h)) >= 0.5 for x in (m.small, outer))
     small = np.asarray(resized(image, w, h), np.uint8)
-    found = beyond_hull.background(small, inside, beyond, np.asarray(resized(share, w, h), np.float32))
+    found = beyond_hull.background(small, inside, beyond, np.asarray(resized(share, w, h), np.float32),
+                                   beyond_hull.many(len(votes.numbers)))  # fmt: skip
     if not found.any() or (inside & ~found).mean() < LIMITS[0]:
         return m
     alpha = beyond_hull.cut(read_alpha(_path(m.view.index, context)), image, inside, found)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from stages.masks import beyond_hull, segment
-from stages.masks.beyond_hull import LARGE, LEAST, MANY, THICK, background, beyond, cut, surely
+from stages.masks.beyond_hull import LARGE, LEAST, MANY, THICK, background, beyond, cut, many, surely
 from stages.masks.region import F32, U8, Bool, dilated
 from stages.masks.sources import PhotoToMask
 from tests.masks.test_masks_stage import SIZE, Scene, ball_alpha, build, iou, run
@@ -46,6 +46,13 @@ def test_what_many_photos_contradict_is_background_whatever_it_looks_like() -> N
     assert not background(picture(SKIN), BODY | PATCH, ~BODY, 0.7 * share).any()
 
 
+def test_of_few_photos_three_must_contradict() -> None:
+    assert many(7) == pytest.approx(2 / 7) and many(40) == MANY and many(0) >= MANY
+    share = np.where(PATCH, np.float32(1 / 6), 0)  # two of seven, one forgiven
+    assert not background(picture(SKIN), BODY | PATCH, ~BODY, share, many(6)).any()
+    assert background(picture(SKIN), BODY | PATCH, ~BODY, 2 * share, many(6)).any()
+
+
 def test_only_a_large_and_thick_region_is_surely_background() -> None:
     """A tuft of hair or a strip along the outline is often missing in many masks."""
     y, x = np.mgrid[:640, :640]
@@ -53,7 +60,7 @@ def test_only_a_large_and_thick_region_is_surely_background() -> None:
 
     def told(width: int, height: int) -> bool:
         part = (abs(x - 500) < width / 2) & (abs(y - 320) < height / 2)
-        return bool(surely(body | part, np.where(part, np.float32(0.5), 0)))
+        return bool(surely(body | part, np.where(part, np.float32(0.5), 0), MANY))
 
     thick = 640 * THICK
     long = LARGE * body.sum() / thick
@@ -116,7 +123,7 @@ def test_single_masks_lose_the_wall_but_not_what_looks_like_the_subject(
 ) -> None:
     """A knob on two masks of twelve, one of them held out; too small for a second segmentation, and no photo counts as
     many."""
-    monkeypatch.setattr(beyond_hull, "MANY", 2.0)
+    monkeypatch.setattr(beyond_hull, "many", lambda _: 2.0)
     scene: Scene = build(tmp_path / "capture", 12, 0.1)
     y, x = np.mgrid[:SIZE, :SIZE] - SIZE / 2
     knob = (abs(y) < 4) & (x > 0) & (x < 52)
