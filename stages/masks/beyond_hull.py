@@ -68,13 +68,18 @@ def background(image: U8, inside: Bool, outer: Bool, share: F32, enough: float =
     deep, around = eroded(inside & ~outer, max(2, round(DEEP * longest))), eroded(~inside, CLEAR)
     if not (deep.any() and around.any()):
         return found
-    sure = surely(inside, share, enough)
-    for part in (*sure, *parts):
+
+    def with_rim(part: Bool) -> tuple[Bool, F32]:
+        """A region and what lies around it (h, w), and how much more like the background that is."""
         ring = dilated(part, max(1, round(RIM * longest))) & inside
-        rather = _rather_background(seen, ring, _next_to(part, deep), _next_to(part, around))
-        if any(part is s for s in sure):
-            found |= _smooth(part | (rather > 0))
-        elif float(rather[part].mean()) > 0:
+        return ring, _rather_background(seen, ring, _next_to(part, deep), _next_to(part, around))
+
+    for part in surely(inside, share, enough):
+        _, rather = with_rim(part)
+        found |= _smooth(part | (rather > 0))
+    for part in parts:
+        ring, rather = with_rim(part)
+        if float(rather[part].mean()) > 0:
             found |= ring & _smooth(rather > np.where(part, -OWN, 0))
     return found
 
