@@ -7,7 +7,8 @@ weights 1 / sigma^2:
 
 lobe     g = 1. The light was estimated from view-dependent residuals for skin's F0 (light_estimate.py). Where it
          explains the share e of the view-dependent variance of skin (or of all points, if that is more), sigma =
-         LOBE_STD ((1 - e) / e)^1.5. Truth: e = 0.47, error 1 % (head_a); e = 0.23, error 26 % (person_e).
+         LEVEL_STD (1 - e) / e. Truth: ln g = .03 at e = .47 (head_a), .14 at .65 (demo), .51 at .31 and .52 at .39
+         (person_e).
 start    g = 1. Without that estimate the level is that of the initial albedo, a middle tone: it says next to nothing.
 eyes     g = SCLERA / (luminance of the whites of the eyes). Sclera is nearly the same for everyone, of any skin tone.
          Left out for closed or hidden eyes.
@@ -43,7 +44,8 @@ F64 = npt.NDArray[np.float64]
 Fact = dict[str, str | float | bool]
 
 FACE, EYES = "face", "eyes"  # names of the labels
-LOBE_STD, START_STD = 0.06, 0.6  # of ln g
+LEVEL_STD, START_STD = 0.2, 0.6  # of ln g
+LOBE_STD = 0.06  # what skin_light.py goes by
 SCLERA, EYES_STD = 0.39, 0.2  # the latter of ln g
 CORRECTED_SCLERA, CORRECTED_STD = 0.49, 0.12  # the same if the light was corrected by the skin
 MIN_PIXELS = 200  # of the eyes, over all photos
@@ -168,7 +170,7 @@ def decide(
             return AlbedoLevel(1.0, 0.0, {"gain": 1.0, "why": "setting, but no pixel has the label face"})
         gain = wanted / max(skin, 1e-6)
         return AlbedoLevel(gain, 0.0, {"gain": round(gain, 4), "face": round(wanted, 4), "why": "setting"})
-    source, std = ("lobe", lobe_std(explained)) if explained is not None else ("start", START_STD)
+    source, std = ("lobe", level_std(explained)) if explained is not None else ("start", START_STD)
     total, weight, facts = 0.0, std**-2, dict[str, str | float | bool]()
     white = sclera(seen)
     if white is not None:
@@ -185,9 +187,16 @@ def decide(
     return AlbedoLevel(gain, weight**-0.5, facts)
 
 
-def lobe_std(explained: float) -> float:
+def level_std(explained: float) -> float:
     """Standard deviation of ln g of a light estimate that explains this share, clamped to [0.01, 0.99]; never more than
     START_STD, the knowledge without an estimate."""
+    e = min(max(explained, 0.01), 0.99)
+    return min(LEVEL_STD * (1 - e) / e, START_STD)
+
+
+def lobe_std(explained: float) -> float:
+    """How far the light's low bands are believed where it explains this share, as level_std; skin_light.py corrects the
+    light by it. Of those bands it is nearer to the truth than of the level."""
     e = min(max(explained, 0.01), 0.99)
     return min(LOBE_STD * math.pow((1 - e) / e, 1.5), START_STD)
 

@@ -230,7 +230,7 @@ def calibrated(capture: Capture, usable: list[int], config: Config, exposures_di
 
 STAGE = Stage(
     name="inverse_rendering",
-    version=56,
+    version=57,
     inputs=Inputs,
     config=Config,
     output=FittedFace,

@@ -22,6 +22,7 @@ from stages.inverse_rendering.albedo_level import (
     apply_gain,
     decide,
     labelled_albedos,
+    level_std,
     lobe_std,
     sclera,
     set_level,
@@ -66,14 +67,14 @@ def test_sources_are_weighted_by_their_variances() -> None:
     seen, e = head(0.3, 1.7), 0.3
     white = sclera(seen)
     assert white is not None
-    a, b = lobe_std(e) ** -2, EYES_STD**-2
+    a, b = level_std(e) ** -2, EYES_STD**-2
     expected = math.exp((a * 0.0 + b * math.log(SCLERA / white)) / (a + b))
     found = decide(seen, None, e)
     assert found.gain == pytest.approx(expected) and found.log_std == pytest.approx((a + b) ** -0.5)
     after = decide(seen, None, e, corrected=True)
     b = CORRECTED_STD**-2
     assert after.gain == pytest.approx(math.exp(b * math.log(CORRECTED_SCLERA / white) / (a + b)))
-    sure = decide(seen, None, 0.95)
+    sure = decide(seen, None, 0.98)
     assert abs(math.log(sure.gain)) < 0.01 and sure.log_std < 0.01
 
 
@@ -115,6 +116,15 @@ def test_the_deviation_of_the_lobe() -> None:
     stds = [lobe_std(e) for e in (0.0, 0.15, 0.23, 0.47, 0.9, 1.0)]
     assert all(a >= b for a, b in zip(stds, stds[1:], strict=False))
     assert stds[0] == START_STD and 0 < stds[-1] < 1e-3 and 0.05 < stds[3] < 0.1
+
+
+def test_the_deviation_of_the_level_has_the_size_of_its_errors() -> None:
+    """Of three heads with a known albedo, by the share that their light explains: within two standard deviations, and
+    the whites of the eyes outweigh a lobe that explains a third."""
+    for e, error in ((0.47, 0.03), (0.65, 0.14), (0.31, 0.51), (0.39, 0.52)):
+        assert error < 2 * level_std(e) < 1.0
+    assert level_std(0.0) == START_STD and 0 < level_std(1.0) < 0.01
+    assert 0.5 * level_std(0.39) > CORRECTED_STD
 
 
 @pytest.mark.parametrize("gain", [0.3, 1.3])
