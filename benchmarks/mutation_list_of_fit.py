@@ -133,6 +133,8 @@ OF_FIT = (
              "tests/pipeline/test_skin_colour.py::test_a_face_that_varies_more_allows_more_but_its_brows_do_not"),
     Mutation("pipeline/registration/head_regions.py", "!= REST, np.bool_", "== REST, np.bool_",
              "tests/bake/test_bake_unseen.py"),
+    Mutation("stages/inverse_rendering/albedo_level.py", "LEVEL_STD * (1 - e) / e", "LOBE_STD * (1 - e) / e",
+             "tests/inverse_rendering/test_albedo_level.py::test_the_deviation_of_the_level_has_the_size_of_its_errors"),
     Mutation("stages/inverse_rendering/albedo_level.py", "math.pow((1 - e) / e, 1.5)", "math.pow(e / (1 - e), 1.5)",
              "tests/inverse_rendering/test_albedo_level.py::test_the_deviation_of_the_lobe"),
     Mutation("stages/inverse_rendering/albedo_level.py", "math.log(usual / white)", "math.log(white / usual)",
