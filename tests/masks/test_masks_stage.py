@@ -263,8 +263,8 @@ def test_a_held_out_mask_ends_where_the_hull_of_the_others_does(
     scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A chair beside the ball in the held-out photo and in a fitted one; masks of half of the ball, which lack a part
-    of the hull's core; and a small thing beside the ball, which may be the subject's in a photo that carved nothing, if
-    it looks like it."""
+    of the hull's core; and a small thing beside the ball that looks like it, which may be the subject's in a photo that
+    carved nothing: it goes only if many photos contradict it."""
     y, x = np.mgrid[:SIZE, :SIZE] - SIZE / 2
     added = {"chair": (abs(x) < 45) & (y > 0), "thing": (abs(y) < 5) & (x > 0) & (x < 56), "half": np.zeros_like(x > 0)}
 
@@ -279,9 +279,15 @@ def test_a_held_out_mask_ends_where_the_hull_of_the_others_does(
 
     own = ball_alpha(scene.cameras[2])
     scene.repaint(2, paint(np.maximum(own, added["thing"]).astype(np.float32), 0.0))
-    for what, source in (("chair", "grabcut+hull"), ("half", "grabcut+hull"), ("thing", "grabcut")):
+    for what, enough, source in (
+        ("chair", 0.12, "grabcut+hull"),
+        ("half", 0.12, "grabcut+hull"),
+        ("thing", 2.0, "grabcut"),
+        ("thing", 0.12, "grabcut+hull"),
+    ):
         monkeypatch.setattr(segment, "mask", made(what))
-        found, alphas = run(scene, tmp_path / what, faces=False)
+        monkeypatch.setattr(segment.beyond_hull, "many", lambda _, share=enough: share)
+        found, alphas = run(scene, tmp_path / f"{what} {enough}", faces=False)
         assert found.masks[2].source == source and found.masks[7].source == "grabcut+hull"
         for i in (2, 7):
             assert iou(alphas[i], ball_alpha(scene.cameras[i])) > 0.9
