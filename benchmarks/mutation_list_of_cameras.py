@@ -263,7 +263,7 @@ OF_CAMERAS = (
     Mutation("stages/bake/odd_colours.py", "wide / (wide + 1 - p)", "wide / (wide + p)",
              f"{ODD}::test_the_formula_of_contradicting_photos"),
     Mutation("stages/bake/odd_colours.py", "np.maximum(out, around / ALL)", "out",
-             f"{ODD}::test_a_torn_back_goes_as_a_whole_and_a_small_corner_does_not"),
+             f"{ODD}::test_a_contradicted_back_goes_as_a_whole_and_a_small_corner_does_not"),
     Mutation("stages/bake/odd_colours.py", "0.5 * (ranked[low] + ranked[high])", "ranked[low]",
              f"{ODD}::test_how_far_photos_are_apart_is_the_median_of_their_errors"),
     Mutation("stages/bake/odd_colours.py", "k = sight.photos * max(1.0, USUAL / usual)", "k = sight.photos",

@@ -9,7 +9,7 @@ may have a colour in one place only, so that nothing of them is doubted.
     R(m) = (RIGHT / WIDE) exp(m / RIGHT - m / WIDE)
 
 and where the mean doubt of such places nearby, weighted by p over NEAR, is larger, that: what few photos show wrongly
-is a patch, and parts of it have a usual colour. Contradictions spread over TORN where most of what is around has them.
+is a patch, and parts of it have a usual colour. Contradictions spread over SPREAD if most of what is around has them.
 
 Symbols: x of a vertex: log luminance of its colour, and the logs of red and of blue over the luminance; k number of
 photos that see it, of those at grazing angles a part, times USUAL / median where the median of the seen vertices is
@@ -41,8 +41,8 @@ SAMPLES, ENOUGH = 400, 50  # vertices that stand for a region; with fewer it has
 MOST = 0.7, 0.3  # doubt from which a colour is replaced, and up to which it is kept
 LEAST = 1e-3  # linear: darker colours count as that
 NEAR = 0.005  # metres: standard deviation of the mean
-# metres; a back that few photos show is torn as a whole from this share on: an eye's corner has well seen skin around
-TORN, ALL = 0.02, 2 / 3
+# metres; a back that few photos show is wrong as a whole from this share on: an eye's corner has well seen skin around
+SPREAD, ALL = 0.02, 2 / 3
 BLOCK = 4096  # vertices at once: 13 MB
 RIGHT, WIDE, FARTHEST = 0.1, 0.5, 1.5  # nine in ten well seen vertices of people are up to .2 apart
 BELIEVED = 12.0  # k from which the doubt is left out: p is .0002
@@ -79,7 +79,7 @@ def _contradicted(mesh: Mesh, p: F64, apart: F64) -> F64:
     wide = p * RIGHT / WIDE * np.exp(m / RIGHT - m / WIDE)
     out: F64 = np.where(told, wide / (wide + 1 - p), 0.0)
     if out.max() > MOST[1]:
-        around = Smoother(mesh, TORN).mean(out[:, None], told.astype(np.float64))[:, 0]
+        around = Smoother(mesh, SPREAD).mean(out[:, None], told.astype(np.float64))[:, 0]
         out = np.where(p > 0, np.maximum(out, around / ALL), 0.0)
     return out
 

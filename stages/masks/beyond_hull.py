@@ -39,7 +39,7 @@ AGAINST = 2.0  # photos, besides the one that may be wrong (hull_votes.FORGIVEN)
 
 def beyond(inside: Bool, outer: Bool) -> list[Bool]:
     """Regions (h, w) of a mask among its pixels `outer` (h, w) beyond the hull, without thin lines."""
-    return regions(dilated(eroded(inside & outer, 1), 1), LEAST * inside.sum())
+    return regions(_without_lines(inside & outer), LEAST * inside.sum())
 
 
 def many(voters: int) -> float:
@@ -51,7 +51,7 @@ def many(voters: int) -> float:
 def surely(inside: Bool, share: F32, enough: float) -> list[Bool]:
     """Regions (h, w) of a mask that are background whatever they look like: large, thick, and contradicted by `enough`
     of the photos (many). share (h, w): hull_votes.contradicting."""
-    return [r for r in regions(dilated(eroded(inside & (share > DOUBT), 1), 1), LARGE * inside.sum())
+    return [r for r in regions(_without_lines(inside & (share > DOUBT)), LARGE * inside.sum())
             if 2 * cv2.distanceTransform(r.astype(np.uint8), cv2.DIST_L2, 5).max() >= THICK * max(r.shape)
             and np.percentile(share[r], MOSTLY) >= enough]  # fmt: skip
 
@@ -107,6 +107,11 @@ def _rather_background(seen: F32, of: Bool, subject: Bool, outside: Bool) -> F32
     own, other = (np.minimum(0.5 * unlike(seen, of, known, SPREAD, near, MOST), MOST) for known in (subject, outside))
     out[of] = own - other
     return out
+
+
+def _without_lines(pixels: Bool) -> Bool:
+    """The pixels (h, w) without what is one or two wide."""
+    return dilated(eroded(pixels, 1), 1)
 
 
 def _smooth(pixels: Bool) -> Bool:

@@ -28,13 +28,14 @@ from pipeline.artifacts import Camera
 from pipeline.silhouettes import lens_radius
 from pipeline.support import Support
 from pipeline.transforms import inverse_rigid, matrix, rays
+from stages.masks.hull_consistency import POSSIBLE
 from stages.masks.region import F32, U8, Bool
 
 TOLERANCE = 2 / 640  # of a mask's longest edge: by which contours, cameras and a breathing subject may be off
 FORGIVEN = 1
 KNOWN, FEWEST = 0.25, 5  # many photos: share and least number of the views that must see a place
-FEW = 3  # the least number further out than AROUND; with fewer, a place does not count
-AROUND, OUTER = 1.4, 2.5  # radii of the region of interest within which places are asked
+FEW = 3  # the least number further out than POSSIBLE; with fewer, a place does not count
+OUTER = 2.5  # radii of the region of interest up to which places are asked
 STEP = 1 / 90  # radii between two places: twice the tolerance, where the region of interest fills a frame
 DOUBT = 0.02  # many photos: share up to which a pixel is the subject's
 F64 = npt.NDArray[np.float64]
@@ -72,7 +73,7 @@ def beyond_all(
     number: the view's place in the list of all views; its own mask is not asked. camera: its camera. roi_radius: asset
     units. support: the subject is above this plane.
     """
-    return _share(votes, number, camera, where, roi_radius, support, _Rule(1, 1, FORGIVEN, AROUND, 0.0)) > 0
+    return _share(votes, number, camera, where, roi_radius, support, _Rule(1, 1, POSSIBLE, 0.0)) > 0
 
 
 def contradicting(
@@ -81,17 +82,18 @@ def contradicting(
     """The share (h, w) of the views, of many photos, that contradict each pixel of `where` (h, w); exact above DOUBT, 0
     elsewhere. Arguments as above."""
     fewest = max(FEWEST, int(np.ceil(KNOWN * len(votes.numbers))))
-    return _share(votes, number, camera, where, roi_radius, support, _Rule(fewest, FEW, FORGIVEN, OUTER, DOUBT))
+    return _share(votes, number, camera, where, roi_radius, support, _Rule(fewest, FEW, OUTER, DOUBT))
 
 
 @dataclass(frozen=True, slots=True)
 class _Rule:
-    """fewest, few: views that must see a place within AROUND, and further out; far: radii up to which places are asked;
-    enough: share at which a ray is done."""
+    """fewest, few: views that must see a place within POSSIBLE, and further out.
+
+    far: radii up to which places are asked. enough: share at which a ray is done.
+    """
 
     fewest: int
     few: int
-    forgiven: int
     far: float
     enough: float
 
@@ -112,9 +114,9 @@ def _share(
     plane = np.zeros(4) if support is None else np.append(support.normal, support.offset)
     own = np.flatnonzero(votes.numbers == number)
     least = np.zeros(len(row))
-    least_contradicting(origin, np.ascontiguousarray(directions), AROUND * roi_radius, rule.far * roi_radius,
+    least_contradicting(origin, np.ascontiguousarray(directions), POSSIBLE * roi_radius, rule.far * roi_radius,
                         STEP * roi_radius, plane, votes.views, votes.shapes, votes.starts, votes.outside,
-                        int(own[0]) if len(own) else -1, rule.fewest, rule.few, rule.forgiven, rule.enough,
+                        int(own[0]) if len(own) else -1, rule.fewest, rule.few, FORGIVEN, rule.enough,
                         least)  # fmt: skip
     out[row, column] = least
     return out

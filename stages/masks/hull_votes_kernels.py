@@ -2,6 +2,9 @@
 
 A view is a row of numbers: 0..11 rows of [R t], camera from world; 12..17 rows of the upper part of K, for the small
 mask; 18..22 k1 k2 p1 p2 k3; 23 the largest squared radius on the plane z = 1 that its lens is for.
+
+The lens is written out, as in visibility_kernels: what numba keeps on disk of a loop is not compiled again when a
+function of another file changes.
 """
 
 # mypy: disable-error-code=no-untyped-def

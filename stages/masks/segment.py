@@ -318,9 +318,10 @@ def _cut(
     if name not in COMPUTED or m.useless:
         return m
     h, w = m.small.shape
+    own = m.small >= 0.5
     here = m.view.disc.scaled(w / m.camera.width).covers(h, w, POSSIBLE)
-    outer = beyond_all(votes, number, m.camera, (m.small >= 0.5) & here, roi_radius, support)
-    if not beyond_hull.beyond(m.small >= 0.5, outer):
+    outer = beyond_all(votes, number, m.camera, own & here, roi_radius, support)
+    if not beyond_hull.beyond(own, outer):
         return m
     share = contradicting(votes, number, m.camera, outer, roi_radius, support)
     image = m.view.read()

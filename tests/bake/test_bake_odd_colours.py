@@ -124,7 +124,7 @@ def test_a_usual_colour_is_doubted_where_two_photos_contradict_each_other() -> N
     assert (doubted(MESH, plain, ONE, sight(2.0), unknown) == doubted(MESH, plain, ONE, sight(2.0))).all()
 
 
-def test_a_torn_back_goes_as_a_whole_and_a_small_corner_does_not() -> None:
+def test_a_contradicted_back_goes_as_a_whole_and_a_small_corner_does_not() -> None:
     """Every second vertex is in one photo, which nothing contradicts."""
     plain, pair = colours(SKIN), np.arange(len(X)) % 2 == 0
 

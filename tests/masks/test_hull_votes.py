@@ -10,8 +10,8 @@ from scipy import ndimage
 from pipeline.artifacts import Camera
 from pipeline.support import Support
 from pipeline.transforms import inverse_rigid, matrix, pixel_centres, project, rays
+from stages.masks.hull_consistency import POSSIBLE
 from stages.masks.hull_votes import (
-    AROUND,
     DOUBT,
     F64,
     FEW,
@@ -48,7 +48,7 @@ def plainly(cameras: list[Camera], gaps: list[F64], number: int, pixel: tuple[in
                      np.array([[pixel[1] + 0.5, pixel[0] + 0.5]]))  # fmt: skip
     middle, voters = -float(d[0] @ origin), range(len(cameras))
     away = float(origin @ origin) - middle**2
-    least, far = 1.0, (OUTER if many else AROUND) * ROI
+    least, far = 1.0, (OUTER if many else POSSIBLE) * ROI
     steps = int(np.sqrt(far**2 - away) / (STEP * ROI))
     for k in range(-steps, steps + 1):
         x = origin + (middle + k * STEP * ROI) * d[0]
@@ -63,7 +63,7 @@ def plainly(cameras: list[Camera], gaps: list[F64], number: int, pixel: tuple[in
                 continue
             seen += 1
             against += gaps[i][int(row), int(column)] > max(1.0, TOLERANCE * SIZE)
-        near = abs(k * STEP * ROI) <= np.sqrt((AROUND * ROI) ** 2 - away)
+        near = abs(k * STEP * ROI) <= np.sqrt((POSSIBLE * ROI) ** 2 - away)
         fewest = (max(FEWEST, np.ceil(KNOWN * len(voters))) if near else FEW) if many else 1
         if seen >= fewest:
             least = min(least, max(against - FORGIVEN, 0) / seen)
