@@ -55,6 +55,18 @@ class Opinion:
     iou: float | None
     core: Bool
 
+    def at_size(self, width: int, height: int) -> Opinion:
+        """The same for a picture of another size."""
+        factor = width / self.silhouette.shape[1]
+
+        def scaled(a: Bool) -> Bool:
+            return np.asarray(cv2.resize(a.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR)) >= 0.5
+
+        margin = max(1, round(self.margin * factor))
+        return Opinion(
+            scaled(self.silhouette), scaled(self.possible), scaled(self.here), margin, self.iou, scaled(self.core)
+        )
+
 
 def tolerated(votes: int) -> int:
     """Number of voting views that may be wrong about a voxel."""

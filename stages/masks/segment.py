@@ -11,7 +11,6 @@ from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
-import cv2
 import numpy as np
 
 from pipeline.artifacts import Camera, CameraSet, Extent, Located, MaskSet, ViewMask
@@ -36,8 +35,9 @@ from stages.masks.hull_consistency import POSSIBLE, Opinion, contradiction, hole
 from stages.masks.hull_votes import Votes, beyond_all, contradicting, votes_of
 from stages.masks.judge import Seen, extent_finding, judge, open_share
 from stages.masks.landmarks import agreed, save_landmarks
+from stages.masks.loose_hair import without_gaps
 from stages.masks.photos import at_once, photos_of
-from stages.masks.region import F32, Bool, resized, working_size
+from stages.masks.region import F32, U8, Bool, Disc, resized, working_size
 from stages.masks.segment_person import of_subject, settled
 from stages.masks.sources import KEY_AND_PERSON, PhotoToMask, Plan, inverted, mask, plan, to_full_size
 from stages.masks.support_object import distinct, object_of
@@ -243,9 +243,7 @@ def _with_needed_parts(
         new = completed(small, inside, lost, needed.hull, m.camera, config.seed)
         if new is None:
             return replace(m, doubtful=part)
-        if name in LEARNED:
-            new = settled(small, new)
-        new = of_subject(new, m.view.disc.scaled(w / image.shape[1]))
+        new = _tidied(small, new, name, m.view.disc.scaled(w / image.shape[1]))
         return _keep(m.view, m.camera, to_full_size(image, new), name + BY_HULL, context)
 
     return _each(one, list(enumerate(masked)), threads, context, "completing masks") if needed.parts else masked
@@ -285,18 +283,23 @@ def _segment_again(made: Masked, opinion: Opinion, bad: bool, config: Config, co
         return made
     image = made.view.read()
     w, h = working_size(image.shape[1], image.shape[0], WORKING_SIZE)
-    opinion_here = _at_size(opinion, w, h)
+    opinion_here = opinion.at_size(w, h)
     prior = np.asarray(resized(made.small, w, h)) >= 0.5
     small = np.asarray(resized(image, w, h), np.uint8)
     shown = distinct(small) if made.source == "object" else small
     new = cut(shown, trimap(prior, opinion_here, filled=filled), config.seed)
-    if made.source in LEARNED:
-        new = settled(small, new)
-    new = of_subject(new, made.view.disc.scaled(w / image.shape[1]))
+    new = _tidied(small, new, made.source, made.view.disc.scaled(w / image.shape[1]))
     before, after = (contradiction(m, opinion_here, filled=filled) + hole(m, opinion_here) for m in (prior, new))
     if after >= before or not LIMITS[0] <= new.mean() <= LIMITS[1]:
         return made
     return _keep(made.view, made.camera, to_full_size(image, new), made.source + BY_HULL, context)
+
+
+def _tidied(small: U8, new: Bool, source: str, disc: Disc) -> Bool:
+    """A new mask (h, w), finished like the one of its method. small: (h, w, 3) 8-bit sRGB."""
+    if source not in LEARNED:
+        return of_subject(new, disc)
+    return without_gaps(small, of_subject(settled(small, new), disc), disc)
 
 
 def _without_background(
@@ -334,16 +337,6 @@ def _cut(
         return m
     alpha = beyond_hull.cut(read_alpha(_path(m.view.index, context)), image, inside, found)
     return _keep(m.view, m.camera, alpha, name + BY_HULL, context)
-
-
-def _at_size(o: Opinion, width: int, height: int) -> Opinion:
-    factor = width / o.silhouette.shape[1]
-
-    def scaled(a: np.typing.NDArray[np.bool_]) -> np.typing.NDArray[np.bool_]:
-        return np.asarray(cv2.resize(a.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR)) >= 0.5
-
-    margin = max(1, round(o.margin * factor))
-    return Opinion(scaled(o.silhouette), scaled(o.possible), scaled(o.here), margin, o.iou, scaled(o.core))
 
 
 def _agreement(masked: list[Masked]) -> float:

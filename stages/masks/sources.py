@@ -15,6 +15,7 @@ from stages.masks.grabcut import INNER, OUTER, cut_by_region
 from stages.masks.hull_consistency import opinions
 from stages.masks.key_person import Network, agree_better, both, key_with_person, loses_a_person
 from stages.masks.keying import Background, border_colours, find_background, key_out, key_out_plate, keyed
+from stages.masks.loose_hair import without_gaps
 from stages.masks.matting import soft_edge
 from stages.masks.region import F32, U8, Bool, Disc, resized, working_size
 from stages.masks.segment_person import of_subject, person_mask
@@ -210,14 +211,14 @@ def mask(view: PhotoToMask, how: Plan, threshold: float, longest: int, seed: int
         return key_out(image, how.background), "key"
     if how.method == "model" and how.model is not None:
         inside = mask_by_model(image, view.disc, how.model, threshold, longest, seed)
-        return to_full_size(image, inside), "model"
+        return to_full_size(image, _without_gaps(image, inside, view.disc)), "model"
     if how.method == "object" and how.solid is not None:
         return to_full_size(image, cut_by_points(image, view.camera, how.solid, longest, seed)), "object"
     if how.method == "person":
         inside = person_mask(image, view.disc, threshold, longest, seed)
         if how.backdrop:
             inside = _against_backdrop(image, inside, view)
-        return to_full_size(image, inside), "person"
+        return to_full_size(image, _without_gaps(image, inside, view.disc)), "person"
     return to_full_size(image, cut_by_region(image, view.disc, longest, seed)), "grabcut"
 
 
@@ -226,6 +227,13 @@ def _against_backdrop(image: U8, inside: Bool, view: PhotoToMask) -> Bool:
     h, w = inside.shape
     small = np.asarray(resized(image, w, h), np.uint8)
     return of_subject(corrected(small, inside), view.disc.scaled(w / image.shape[1]))
+
+
+def _without_gaps(image: U8, inside: Bool, disc: Disc) -> Bool:
+    """A network's mask (h, w) without the gaps in loose hair. image: (H, W, 3) 8-bit sRGB."""
+    h, w = inside.shape
+    small = np.asarray(resized(image, w, h), np.uint8)
+    return without_gaps(small, inside, disc.scaled(w / image.shape[1]))
 
 
 def inverted(alpha: F32, disc: Disc) -> bool:
