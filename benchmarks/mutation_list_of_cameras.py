@@ -16,7 +16,7 @@ PARTS, COMPLETE = "tests/pipeline/test_needed_parts.py", "tests/masks/test_compl
 NEEDS, EXTENT = "tests/pipeline/test_hull_needs.py", "tests/masks/test_masks_extent.py"
 FLOW = "tests/inverse_rendering/test_depth_from_flow.py"
 BEYOND, SPOTS = "tests/masks/test_beyond_hull.py", "tests/usd/test_usd_judge.py"
-VOTES = "tests/masks/test_hull_votes.py"
+VOTES, HAIR = "tests/masks/test_hull_votes.py", "tests/masks/test_loose_hair.py"
 IMAGES, RENDER = "tests/core/test_images.py", "tests/usd/test_usd_render.py"
 
 OF_CAMERAS = (
@@ -65,6 +65,23 @@ OF_CAMERAS = (
     Mutation("stages/masks/beyond_hull.py", ">= enough]", ">= 0]",
              f"{BEYOND}::test_what_many_photos_contradict_is_background_whatever_it_looks_like"),
     # ---------------------------------------------------------------- how many photos contradict a pixel
+    Mutation("stages/masks/loose_hair.py", "rise > LOW * height**2", "rise > 0", HAIR),
+    Mutation("stages/masks/loose_hair.py", "(ring & head.face).any() or ", "", HAIR),
+    Mutation("stages/masks/loose_hair.py", "(ring & inside & ~seen.mixed).sum() > FOREIGN * ring.sum()", "False", HAIR),
+    Mutation("stages/masks/loose_hair.py", ">= HAIR * max(", ">= 0 * max(", HAIR),
+    Mutation("stages/masks/loose_hair.py", " & (variance[..., 0] < EVEN**2 * square)", "", HAIR),
+    Mutation("stages/masks/loose_hair.py", "<= MOST * head.face.sum()", "<= 99 * head.face.sum()", HAIR),
+    Mutation("stages/masks/loose_hair.py", "hair & close", "hair", HAIR),
+    Mutation("stages/masks/loose_hair.py", "> FAR) &", "> -9) &", HAIR),
+    Mutation("stages/masks/loose_hair.py", "known & far[2] & on_line & told", "known & far[2] & told", HAIR),
+    Mutation("stages/masks/loose_hair.py", "(face + step * up)", "(face - step * up)", HAIR),
+    Mutation("stages/masks/loose_hair.py", "left & edge &", "left &", HAIR),
+    Mutation("stages/masks/loose_hair.py", "(seen.alpha < SOLID)", "(seen.alpha < 0.5)", HAIR),
+    Mutation("stages/masks/sources.py", "np.minimum(alpha, np.float32(COLOURLESS))", "alpha", HAIR),
+    Mutation("stages/masks/segment_person.py", "(found <= SURE), BROAD * radius)", "(found <= SURE), radius)",
+             "tests/masks/test_masks_sources.py"),
+    Mutation("stages/masks/segment_person.py", "inside & (found <= SURE)", "inside & (found <= 0.5)",
+             "tests/masks/test_masks_sources.py"),
     Mutation("stages/masks/hull_votes_kernels.py", "max(against - forgiven, 0) / seen", "against / seen",
              f"{VOTES}::test_its_own_mask_has_no_vote_and_one_wrong_mask_is_forgiven"),
     Mutation("stages/masks/hull_votes_kernels.py", "        if v == skip:", "        if v == -2:",

@@ -35,7 +35,7 @@ REACH = 0.17  # of the face's height: window that continues the background, and 
 LOW = 0.25  # of the face's height above the chin, about the lips: below are necks, and shoulders of the wall's colour
 FOREHEAD = 0.15  # of the face's height above its landmarks that is still face
 BESIDE = 0.12  # of the face's height: thin hair this close to a gap goes with it
-THIN = 2  # pixels: half of the width that hair must have to stay there
+THIN = 0.035  # of the face's height: half of the width that hair must have to stay there
 MARGIN = 2  # pixels outside of the mask where the background begins
 DARKER, FAR = np.log(2.0), np.log(2.5)  # of luminances: colours that F is the mean of, and F itself, against B
 HAIR = 0.3  # least share of such colours among the mask's pixels around a gap
@@ -45,6 +45,8 @@ EVEN = 0.15  # largest deviation of the background about its continuation, of |F
 FOREIGN = 0.25  # largest share of a gap's surroundings that is neither mixed nor outside
 LEAST, MOST = 0.0005, 0.3  # of the mask and of the face: sizes of a gap
 AROUND = 2  # pixels: its surroundings
+SOLID = 0.7  # alpha of hair through which no wall is seen
+EDGE = 0.1  # of the face's height: how far from the outline a wall can be seen through hair
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,18 +73,23 @@ class Mixtures:
     hair: Bool
 
 
-def without_gaps(image: U8, inside: Bool, disc: Disc) -> Bool:
-    """The mask (h, w) of a person without the gaps in loose hair. image: (h, w, 3) 8-bit sRGB. disc: the region of
-    interest, in which the face is searched."""
+def with_loose_hair(image: U8, inside: Bool, disc: Disc) -> tuple[Bool, Bool]:
+    """The mask (h, w) of a person without the gaps in loose hair, and which of its pixels show hair and wall at once.
+
+    image: (h, w, 3) 8-bit sRGB. disc: the region of interest, in which the face is searched.
+    """
     face = find_face(image, disc.x, disc.y, SEARCHED * disc.radius, disc.roll) if inside.any() else None
-    return inside if face is None else inside & ~gaps(image, inside, face.points)
+    if face is None:
+        return inside, np.zeros_like(inside)
+    head = head_in(inside, face.points)
+    seen = mixtures(LINEAR[np.asarray(cv2.GaussianBlur(image, (0, 0), BLUR), np.uint8)], inside, head)
+    left = inside & ~gaps(inside, seen, head)
+    edge = dilated(~left, max(1, round(EDGE * head.height)))
+    return left, left & edge & head.above & ~head.face & seen.mixed & (seen.alpha < SOLID)
 
 
-def gaps(image: U8, inside: Bool, face: F64) -> Bool:
-    """Pixels (h, w) of a mask (h, w) that are gaps. image: (h, w, 3) 8-bit sRGB. face: (468, 2) landmarks in pixels."""
-    head = head_in(inside, face)
-    colour = LINEAR[np.asarray(cv2.GaussianBlur(image, (0, 0), BLUR), np.uint8)]
-    seen = mixtures(colour, inside, head)
+def gaps(inside: Bool, seen: Mixtures, head: Head) -> Bool:
+    """Pixels (h, w) of a mask (h, w) that are gaps in loose hair."""
     may_be = inside & head.above & seen.mixed & (seen.alpha < 0.5)
     count, label, stats, _ = cv2.connectedComponentsWithStats(may_be.astype(np.uint8), connectivity=4)
     found = np.zeros_like(inside)
@@ -145,4 +152,5 @@ def _thin_beside(found: Bool, hair: Bool, left: Bool, head: Head) -> Bool:
     if not found.any():
         return found
     close = dilated(found, max(1, round(BESIDE * head.height)))
-    return hair & close & ~dilated(eroded(left, THIN), THIN)
+    thin = max(2, round(THIN * head.height))
+    return hair & close & ~dilated(eroded(left, thin), thin)

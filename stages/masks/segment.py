@@ -35,11 +35,10 @@ from stages.masks.hull_consistency import POSSIBLE, Opinion, contradiction, hole
 from stages.masks.hull_votes import Votes, beyond_all, contradicting, votes_of
 from stages.masks.judge import Seen, extent_finding, judge, open_share
 from stages.masks.landmarks import agreed, save_landmarks
-from stages.masks.loose_hair import without_gaps
 from stages.masks.photos import at_once, photos_of
 from stages.masks.region import F32, U8, Bool, Disc, resized, working_size
 from stages.masks.segment_person import of_subject, settled
-from stages.masks.sources import KEY_AND_PERSON, PhotoToMask, Plan, inverted, mask, plan, to_full_size
+from stages.masks.sources import KEY_AND_PERSON, PhotoToMask, Plan, inverted, mask, person_alpha, plan, to_full_size
 from stages.masks.support_object import distinct, object_of
 from stages.masks.user_model import UserModel, hair_model, user_model
 
@@ -244,7 +243,7 @@ def _with_needed_parts(
         if new is None:
             return replace(m, doubtful=part)
         new = _tidied(small, new, name, m.view.disc.scaled(w / image.shape[1]))
-        return _keep(m.view, m.camera, to_full_size(image, new), name + BY_HULL, context)
+        return _keep(m.view, m.camera, _alpha(image, new, name, m.view.disc), name + BY_HULL, context)
 
     return _each(one, list(enumerate(masked)), threads, context, "completing masks") if needed.parts else masked
 
@@ -292,14 +291,18 @@ def _segment_again(made: Masked, opinion: Opinion, bad: bool, config: Config, co
     before, after = (contradiction(m, opinion_here, filled=filled) + hole(m, opinion_here) for m in (prior, new))
     if after >= before or not LIMITS[0] <= new.mean() <= LIMITS[1]:
         return made
-    return _keep(made.view, made.camera, to_full_size(image, new), made.source + BY_HULL, context)
+    return _keep(made.view, made.camera, _alpha(image, new, made.source, made.view.disc), made.source + BY_HULL,
+                 context)  # fmt: skip
 
 
 def _tidied(small: U8, new: Bool, source: str, disc: Disc) -> Bool:
     """A new mask (h, w), finished like the one of its method. small: (h, w, 3) 8-bit sRGB."""
-    if source not in LEARNED:
-        return of_subject(new, disc)
-    return without_gaps(small, of_subject(settled(small, new), disc), disc)
+    return of_subject(settled(small, new) if source in LEARNED else new, disc)
+
+
+def _alpha(image: U8, new: Bool, source: str, disc: Disc) -> F32:
+    """Alpha (H, W) from a new hard mask (h, w), as its method makes it. image: (H, W, 3) 8-bit sRGB."""
+    return person_alpha(image, new, disc) if source in LEARNED else to_full_size(image, new)
 
 
 def _without_background(

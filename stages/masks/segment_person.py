@@ -17,13 +17,14 @@ from pipeline.networks import network
 from stages.masks.grabcut import cut
 from stages.masks.matting import between, largest_parts
 from stages.masks.refine_contour import refined_contour
-from stages.masks.region import F32, U8, Bool, Disc, dilated, eroded, resized, working_size
+from stages.masks.region import F32, U8, Bool, Disc, dilated, eroded, resized, thick, working_size
 
 MODEL = Path(__file__).parent / "models" / "selfie_segmentation.tflite"
 SIDE = 256  # the network's input
 CROP = 1.6  # half-edge of the crop in radii of the region of interest
 UNSURE = 2.5  # network pixels on both sides of its contour that GrabCut decides
 LOOKS = ((0.0, False), (0.0, True), (0.2, False), (-0.2, True))  # turns in radians, and whether mirrored; averaged
+SURE, BROAD = 0.95, 3  # probability below which a region is unsure that is broader than so many times UNSURE
 MIN_PART = 0.3  # of the largest component: smaller ones are errors of the network
 
 
@@ -106,6 +107,7 @@ def refined(small: U8, found: F32, scale: float, disc: Disc, threshold: float, s
     radius = max(2, round(UNSURE * scale))
     trimap = np.where(inside, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
     trimap[eroded(inside, radius)] = cv2.GC_FGD
+    trimap[thick(inside & (found <= SURE), BROAD * radius)] = cv2.GC_PR_FGD
     trimap[~dilated(inside, radius)] = cv2.GC_BGD
     return of_subject(settled(small, of_subject(cut(small, trimap, seed), disc)), disc)
 

@@ -15,7 +15,7 @@ from stages.masks.grabcut import INNER, OUTER, cut_by_region
 from stages.masks.hull_consistency import opinions
 from stages.masks.key_person import Network, agree_better, both, key_with_person, loses_a_person
 from stages.masks.keying import Background, border_colours, find_background, key_out, key_out_plate, keyed
-from stages.masks.loose_hair import without_gaps
+from stages.masks.loose_hair import with_loose_hair
 from stages.masks.matting import soft_edge
 from stages.masks.region import F32, U8, Bool, Disc, resized, working_size
 from stages.masks.segment_person import of_subject, person_mask
@@ -30,6 +30,7 @@ BETTER = 0.05  # of IoU with the hull: an object's masks must agree by so much b
 CHOICE_SIZE, CHOICE_CELLS = 320, 64  # pixels and voxels for the choice
 MIN_AROUND, WRONG_SIDE = 0.02, 0.3  # smallest share of the photo around the region; mean alpha of a nearly empty area
 KEY_AND_PERSON = "key+person"
+COLOURLESS = 0.98  # alpha of a pixel that is the subject's, but whose colour is not: the fit uses those above 0.99
 SOFT = 2  # pixels of the working size: accuracy of a segmented contour
 
 
@@ -211,14 +212,14 @@ def mask(view: PhotoToMask, how: Plan, threshold: float, longest: int, seed: int
         return key_out(image, how.background), "key"
     if how.method == "model" and how.model is not None:
         inside = mask_by_model(image, view.disc, how.model, threshold, longest, seed)
-        return to_full_size(image, _without_gaps(image, inside, view.disc)), "model"
+        return person_alpha(image, inside, view.disc), "model"
     if how.method == "object" and how.solid is not None:
         return to_full_size(image, cut_by_points(image, view.camera, how.solid, longest, seed)), "object"
     if how.method == "person":
         inside = person_mask(image, view.disc, threshold, longest, seed)
         if how.backdrop:
             inside = _against_backdrop(image, inside, view)
-        return to_full_size(image, _without_gaps(image, inside, view.disc)), "person"
+        return person_alpha(image, inside, view.disc), "person"
     return to_full_size(image, cut_by_region(image, view.disc, longest, seed)), "grabcut"
 
 
@@ -227,13 +228,6 @@ def _against_backdrop(image: U8, inside: Bool, view: PhotoToMask) -> Bool:
     h, w = inside.shape
     small = np.asarray(resized(image, w, h), np.uint8)
     return of_subject(corrected(small, inside), view.disc.scaled(w / image.shape[1]))
-
-
-def _without_gaps(image: U8, inside: Bool, disc: Disc) -> Bool:
-    """A network's mask (h, w) without the gaps in loose hair. image: (H, W, 3) 8-bit sRGB."""
-    h, w = inside.shape
-    small = np.asarray(resized(image, w, h), np.uint8)
-    return without_gaps(small, inside, disc.scaled(w / image.shape[1]))
 
 
 def inverted(alpha: F32, disc: Disc) -> bool:
@@ -254,3 +248,16 @@ def to_full_size(image: U8, inside: Bool) -> F32:
     factor = w / inside.shape[1]
     hard = inside if factor == 1 else np.asarray(resized(inside.astype(np.float32), w, h), np.float32) >= 0.5
     return soft_edge(image, hard, max(2, min(12, round(SOFT * factor))))
+
+
+def person_alpha(image: U8, inside: Bool, disc: Disc) -> F32:
+    """Alpha (H, W) of a photo (H, W, 3) from a person's smaller hard mask (h, w): without the gaps in loose hair, and
+    below 1 where the wall shines through hair, so that its colour is not used."""
+    h, w = inside.shape
+    small = np.asarray(resized(image, w, h), np.uint8)
+    left, mixed = with_loose_hair(small, inside, disc.scaled(w / image.shape[1]))
+    alpha = to_full_size(image, left)
+    if not mixed.any():
+        return alpha
+    zone = np.asarray(resized(mixed.astype(np.float32), image.shape[1], image.shape[0])) >= 0.5
+    return np.where(zone, np.minimum(alpha, np.float32(COLOURLESS)), alpha)

@@ -9,8 +9,9 @@ import pytest
 
 from pipeline.colour import srgb_from_linear
 from pipeline.faces.find import Face
-from stages.masks import loose_hair
-from stages.masks.loose_hair import CHIN, HAIR, LEAST, TOP, gaps, head_in, mixtures, without_gaps
+from stages.inverse_rendering.ray_sampling import WHOLE
+from stages.masks import loose_hair, sources
+from stages.masks.loose_hair import CHIN, HAIR, LEAST, TOP, gaps, head_in, mixtures, with_loose_hair
 from stages.masks.region import LINEAR, U8, Bool, Disc, eroded
 
 F64 = npt.NDArray[np.float64]
@@ -52,7 +53,8 @@ def encoded(linear: tuple[float, ...]) -> npt.NDArray[np.uint8]:
 
 
 def found(image: U8, inside: Bool = SUBJECT) -> Bool:
-    return gaps(image, inside, landmarks()) & inside
+    head = head_in(inside, landmarks())
+    return gaps(inside, mixtures(LINEAR[image], inside, head), head)
 
 
 @pytest.mark.parametrize("strands", [0.0, 0.25, 0.4])
@@ -172,10 +174,33 @@ def test_thin_hair_far_from_a_gap_stays() -> None:
 def test_without_a_face_the_mask_stays(monkeypatch: pytest.MonkeyPatch) -> None:
     image, disc = picture(), Disc(160, 190, 150, 0)
     monkeypatch.setattr(loose_hair, "find_face", lambda *_: None)
-    assert (without_gaps(image, SUBJECT, disc) == SUBJECT).all()
+    left, mixed = with_loose_hair(image, SUBJECT, disc)
+    assert (left == SUBJECT).all() and not mixed.any()
     monkeypatch.setattr(loose_hair, "find_face", lambda *_: Face(landmarks(), 1.0))
-    cut = without_gaps(image, SUBJECT, disc)
-    assert cut[eroded(GAP, 1)].mean() < 0.02 and not (cut & ~SUBJECT).any()
+    left, mixed = with_loose_hair(image, SUBJECT, disc)
+    assert left[eroded(GAP, 1)].mean() < 0.02 and not ((left | mixed) & ~SUBJECT).any()
+
+
+def test_hair_that_the_wall_shines_through_is_told_near_the_outline_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    image, disc = picture(strands=1.0), Disc(160, 190, 150, 0)
+    edge = HAIR_CAP & ~eroded(SUBJECT, 3) & eroded(SUBJECT, 1) & (Y < 180)
+    sheen = HAIR_CAP & (((X - 160) / 12) ** 2 + ((Y - 105) / 8) ** 2 < 1)
+    image[edge | sheen] = encoded(tuple(0.5 * d + 0.5 * w for d, w in zip(DARK, WALL, strict=True)))
+    monkeypatch.setattr(loose_hair, "find_face", lambda *_: Face(landmarks(), 1.0))
+    left, mixed = with_loose_hair(image, SUBJECT, disc)
+    assert (left == SUBJECT).all()
+    assert mixed[edge].mean() > 0.5 and not mixed[sheen].any() and not mixed[FACE | BODY].any()
+
+
+def test_colours_of_such_hair_are_not_used(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its alpha stays the subject's, and below what the fit takes colours from."""
+    image = picture(strands=1.0)
+    mixed = HAIR_CAP & (X < 110)
+    monkeypatch.setattr(sources, "with_loose_hair", lambda _, inside, __: (inside, mixed))
+    alpha = sources.person_alpha(image, SUBJECT, Disc(160, 190, 150, 0))
+    assert (alpha[mixed & eroded(SUBJECT, 4)] == np.float32(sources.COLOURLESS)).all()
+    assert sources.COLOURLESS < WHOLE and round(sources.COLOURLESS * 255) / 255 < WHOLE
+    assert (alpha[eroded(SUBJECT, 4) & ~mixed] == 1).all()
 
 
 @pytest.mark.parametrize("level", [0, 255])
@@ -192,4 +217,6 @@ def test_a_tilted_head_is_measured_along_its_own_axis() -> None:
     image = np.asarray(cv2.warpAffine(picture(), turn, (SIZE, SIZE), borderMode=cv2.BORDER_REPLICATE), np.uint8)
     inside, gap = (cv2.warpAffine(m.astype(np.uint8), turn, (SIZE, SIZE)) > 0 for m in (SUBJECT, GAP))
     points = np.c_[landmarks(), np.ones(468)] @ turn.T
-    assert (gaps(image, np.asarray(inside), points) & gap).sum() > 0.9 * gap.sum()
+    head = head_in(np.asarray(inside), points)
+    cut = gaps(np.asarray(inside), mixtures(LINEAR[image], np.asarray(inside), head), head)
+    assert (cut & gap).sum() > 0.9 * gap.sum()

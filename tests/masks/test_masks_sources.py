@@ -19,7 +19,7 @@ from stages.masks.grabcut import cut, cut_by_region
 from stages.masks.keying import Background, border_colours, find_background, key_out
 from stages.masks.matting import largest_parts, soft_edge
 from stages.masks.region import Disc, dilated, eight_bit, eroded, region, resized, working_size
-from stages.masks.segment_person import MODEL, of_subject, person_mask, person_probability, probability
+from stages.masks.segment_person import MODEL, of_subject, person_mask, person_probability, probability, refined
 
 F32 = npt.NDArray[np.float32]
 U8 = npt.NDArray[np.uint8]
@@ -241,6 +241,21 @@ def test_of_subject_drops_strays_and_fills_small_holes() -> None:
     found = of_subject(mask, Disc(80, 80, 60, 0))
     assert found[80, 80] and not found[:30, :30].any()
     assert not of_subject(np.zeros((50, 50), bool), Disc(25, 25, 10, 0)).any()
+
+
+@pytest.mark.parametrize(("sure", "width", "stays"), [(0.99, 100, True), (0.7, 100, False), (0.7, 30, True)])
+def test_colours_decide_where_the_network_is_unsure_of_something_broad(sure: float, width: int, stays: bool) -> None:
+    """A part of a bench beside a person. What is narrow is at the contour, where GrabCut decides anyway up
+    to its own width."""
+    y, x = np.mgrid[:320, :320]
+    body, wood = np.hypot(x - 110, y - 160) < 70, (np.abs(y - 160) < width / 2) & (x >= 110)
+    bench, floor = wood & (x < 240), y > 260
+    image = np.full((320, 320, 3), (200, 200, 190), np.uint8)
+    image[floor | wood], image[body] = (90, 60, 30), (60, 110, 160)
+    image = (image + np.random.default_rng(0).normal(0, 2, image.shape)).clip(0, 255).astype(np.uint8)
+    network = np.where(body, 1.0, np.where(bench, sure, 0.0)).astype(np.float32)
+    found = refined(image, network, 2.0, Disc(110, 160, 80, 0), 0.5, 0)
+    assert iou(found.astype(np.float32), (body | (bench if stays else body)).astype(np.float32)) > 0.95
 
 
 # ------------------------------------------------------------------ grabCut
