@@ -37,6 +37,7 @@ KNOWN, FEWEST = 0.25, 5  # many photos: share and least number of the views that
 FEW = 3  # the least number further out than POSSIBLE; with fewer, a place does not count
 OUTER = 2.5  # radii of the region of interest up to which places are asked
 STEP = 1 / 90  # radii between two places: twice the tolerance, where the region of interest fills a frame
+SLIGHTEST = 1e-6  # share below that of one of all photos: any share above 0 will do
 DOUBT = 0.02  # many photos: share up to which a pixel is the subject's
 F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]
@@ -73,7 +74,7 @@ def beyond_all(
     number: the view's place in the list of all views; its own mask is not asked. camera: its camera. roi_radius: asset
     units. support: the subject is above this plane.
     """
-    return _share(votes, number, camera, where, roi_radius, support, _Rule(1, 1, POSSIBLE, 0.0)) > 0
+    return _share(votes, number, camera, where, roi_radius, support, _Rule(1, 1, POSSIBLE, SLIGHTEST, 0.0)) > 0
 
 
 def contradicting(
@@ -82,19 +83,21 @@ def contradicting(
     """The share (h, w) of the views, of many photos, that contradict each pixel of `where` (h, w); exact above DOUBT, 0
     elsewhere. Arguments as above."""
     fewest = max(FEWEST, int(np.ceil(KNOWN * len(votes.numbers))))
-    return _share(votes, number, camera, where, roi_radius, support, _Rule(fewest, FEW, OUTER, DOUBT))
+    return _share(votes, number, camera, where, roi_radius, support, _Rule(fewest, FEW, OUTER, 1.0, DOUBT))
 
 
 @dataclass(frozen=True, slots=True)
 class _Rule:
     """fewest, few: views that must see a place within POSSIBLE, and further out.
 
-    far: radii up to which places are asked. enough: share at which a ray is done.
+    far: radii up to which places are asked. most: share above which they need not differ. enough: share at which a ray
+    is done.
     """
 
     fewest: int
     few: int
     far: float
+    most: float
     enough: float
 
 
@@ -116,8 +119,8 @@ def _share(
     least = np.zeros(len(row))
     least_contradicting(origin, np.ascontiguousarray(directions), POSSIBLE * roi_radius, rule.far * roi_radius,
                         STEP * roi_radius, plane, votes.views, votes.shapes, votes.starts, votes.outside,
-                        int(own[0]) if len(own) else -1, rule.fewest, rule.few, FORGIVEN, rule.enough,
-                        least)  # fmt: skip
+                        int(own[0]) if len(own) else -1, rule.fewest, rule.few, FORGIVEN, rule.most,
+                        rule.enough, least)  # fmt: skip
     out[row, column] = least
     return out
 

@@ -55,9 +55,12 @@ def _contradicting(views, shapes, starts, outside, skip, fewest, forgiven, best,
 
 @njit(nogil=True, error_model="numpy", cache=True)  # photos are worked on side by side in threads
 def least_contradicting(origin, directions, near, far, step, plane, views, shapes, starts, outside, skip, fewest, few,
-                        forgiven, enough, least):  # fmt: skip
-    """Write to least (N,) the smallest share over the places on each ray, from the place nearest to the world's origin
-    outwards; a ray ends at the first share up to `enough`, and is 0 where it misses the inner sphere.
+                        forgiven, most, enough, least):  # fmt: skip
+    """Write to least (N,) the smallest share over the places on each ray, `most` if all are larger; a ray ends at the
+    first share up to `enough`, and is 0 where it misses the inner sphere.
+
+    The place that was best on the ray before is asked first: neighbours see the same surface, and a small share lets
+    all other places be left early. Then from the place nearest to the world's origin outwards.
 
     origin (3,), directions (N, 3) unit. near, far: radii of two spheres: in the inner one a place that fewer than
     `fewest` views see counts as 0, between the two one that fewer than `few` see does not count; step: between two
@@ -66,6 +69,7 @@ def least_contradicting(origin, directions, near, far, step, plane, views, shape
     shapes (V, 2) rows and columns of each mask, starts (V,) its first byte in outside (bytes,), 1 where a pixel is
     clearly background. skip: the view of the rays, -1 if it has no vote.
     """
+    first = 0
     for i in range(len(directions)):
         dx, dy, dz = directions[i, 0], directions[i, 1], directions[i, 2]
         middle = -(dx * origin[0] + dy * origin[1] + dz * origin[2])
@@ -73,8 +77,12 @@ def least_contradicting(origin, directions, near, far, step, plane, views, shape
         least[i] = 0.0
         if not near * near > away:
             continue
-        best, inner, half = 1.0, np.sqrt(near * near - away), np.sqrt(far * far - away)
-        for k in range(2 * int(half / step) + 1):
+        best, inner, half = most, np.sqrt(near * near - away), np.sqrt(far * far - away)
+        places, before = 2 * int(half / step) + 1, first
+        for n in range(-1, places):
+            k = before if n < 0 else n
+            if k >= places or (n >= 0 and k == before):
+                continue
             along = middle + step * ((k + 1) // 2) * (1 - 2 * (k % 2))
             if not along > 0:
                 continue
@@ -85,7 +93,9 @@ def least_contradicting(origin, directions, near, far, step, plane, views, shape
             share = _contradicting(
                 views, shapes, starts, outside, skip, fewest if known else few, forgiven, best, x, y, z
             )
-            best = min(best, max(share, 0.0) if known or share >= 0 else best)
+            share = max(share, 0.0) if known or share >= 0 else best
+            if share < best:
+                best, first = share, k
             if best <= enough:
                 break
         least[i] = best
