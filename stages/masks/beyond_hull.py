@@ -2,8 +2,8 @@
 
 What lies beyond the visual hull (hull_votes: no place on a pixel's ray is the subject's in the other photos) is the
 wall between a chin and a chest, or a part of the turntable. The hull errs too: what some masks lack, it lacks in every
-view. So a thick part that many photos contradict is cut off whatever it looks like, and of the rest the colours have
-the last word. A region is cut off where its mean of
+view. So a thick part that many photos contradict is cut off whatever it looks like, a thin one if a third of them do,
+and of the rest the colours have the last word. A region is cut off where its mean of
 
     min(d_in^2 / 2, MOST) - min(d_out^2 / 2, MOST)
 
@@ -34,6 +34,7 @@ RIM, DEEP = 3 / 640, 8 / 640  # of the longest edge: around a region; inside of 
 # colours don't count from: a region's share of the mask, its thickness (of the longest edge), share of the photos
 LARGE, THICK, MANY = 0.002, 7 / 640, 0.12
 MOSTLY = 90  # percentile of a region's shares that is compared with that
+MAJORITY = 0.35  # share of the photos that see a pixel's places from which its region may have any shape
 AGAINST = 2.0  # photos, besides the one that may be wrong (hull_votes.FORGIVEN)
 
 
@@ -50,10 +51,13 @@ def many(voters: int) -> float:
 
 def surely(inside: Bool, share: F32, enough: float) -> list[Bool]:
     """Regions (h, w) of a mask that are background whatever they look like: large, thick, and contradicted by `enough`
-    of the photos (many). share (h, w): hull_votes.contradicting."""
-    return [r for r in regions(_without_lines(inside & (share > DOUBT)), LARGE * inside.sum())
-            if 2 * cv2.distanceTransform(r.astype(np.uint8), cv2.DIST_L2, 5).max() >= THICK * max(r.shape)
-            and np.percentile(share[r], MOSTLY) >= enough]  # fmt: skip
+    of the photos (many); or of any shape, where MAJORITY of the photos contradict each pixel. share (h, w):
+    hull_votes.contradicting."""
+    broad = [r for r in regions(_without_lines(inside & (share > DOUBT)), LARGE * inside.sum())
+             if 2 * cv2.distanceTransform(r.astype(np.uint8), cv2.DIST_L2, 5).max() >= THICK * max(r.shape)
+             and np.percentile(share[r], MOSTLY) >= enough]  # fmt: skip
+    most = inside & (share >= max(MAJORITY, enough))
+    return broad + regions(_without_lines(most), LEAST * inside.sum())
 
 
 def background(image: U8, inside: Bool, outer: Bool, share: F32, enough: float = MANY) -> Bool:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from stages.masks import beyond_hull, segment
-from stages.masks.beyond_hull import LARGE, LEAST, MANY, THICK, background, beyond, cut, many, surely
+from stages.masks.beyond_hull import LARGE, LEAST, MAJORITY, MANY, THICK, background, beyond, cut, many, surely
 from stages.masks.region import F32, U8, Bool, dilated
 from stages.masks.sources import PhotoToMask
 from tests.masks.test_masks_stage import SIZE, Scene, ball_alpha, build, iou, run
@@ -60,13 +60,25 @@ def test_only_a_large_and_thick_region_is_surely_background() -> None:
 
     def told(width: int, height: int) -> bool:
         part = (abs(x - 500) < width / 2) & (abs(y - 320) < height / 2)
-        return bool(surely(body | part, np.where(part, np.float32(0.5), 0), MANY))
+        return bool(surely(body | part, np.where(part, np.float32(0.9 * MAJORITY), 0), MANY))
 
     thick = 640 * THICK
     long = LARGE * body.sum() / thick
     assert told(round(1.5 * thick), round(2 * long))
     assert not told(round(0.5 * thick), round(4 * long))
     assert not told(round(1.2 * thick), round(0.6 * long))
+
+
+def test_what_a_third_of_the_photos_contradict_is_background_of_any_shape() -> None:
+    """Strands of a loop of hair that the other photos' masks have cut off."""
+    y, x = np.mgrid[:640, :640]
+    body, strand = np.hypot(x - 200, y - 320) < 150, (abs(y - 320) < 2) & (x > 360) & (x < 500)
+    for share, cut_off in ((0.9 * MAJORITY, False), (1.1 * MAJORITY, True)):
+        votes = np.where(strand, np.float32(share), 0)
+        found = surely(body | strand, votes, MANY)
+        assert bool(found) == cut_off
+        assert not surely(body | strand, votes, 0.5)  # of few photos more must contradict
+    assert (found[0] & strand).sum() > 0.9 * strand.sum() and not (found[0] & body).any()
 
 
 @pytest.mark.parametrize("colour", [WALL, SKIN])
