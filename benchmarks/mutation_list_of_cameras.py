@@ -65,6 +65,8 @@ OF_CAMERAS = (
     Mutation("stages/masks/beyond_hull.py", ">= enough]", ">= 0]",
              f"{BEYOND}::test_what_many_photos_contradict_is_background_whatever_it_looks_like"),
     # ---------------------------------------------------------------- how many photos contradict a pixel
+    Mutation("stages/masks/beyond_hull.py", "max(MAJORITY, enough)", "enough", BEYOND),
+    Mutation("stages/masks/beyond_hull.py", "max(MAJORITY, enough)", "MAJORITY", BEYOND),
     Mutation("stages/masks/loose_hair.py", "rise > LOW * height**2", "rise > 0", HAIR),
     Mutation("stages/masks/loose_hair.py", "(ring & head.face).any() or ", "", HAIR),
     Mutation("stages/masks/loose_hair.py", "(ring & inside & ~seen.mixed).sum() > FOREIGN * ring.sum()", "False", HAIR),
