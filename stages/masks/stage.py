@@ -30,4 +30,4 @@ def run(inputs: Inputs, config: Config, context: Context) -> MaskSet:
     return segment(inputs.capture, inputs.poses, config, context)
 
 
-STAGE = Stage(name="masks", version=26, inputs=Inputs, config=Config, output=MaskSet, run=run, any_threads=True)
+STAGE = Stage(name="masks", version=27, inputs=Inputs, config=Config, output=MaskSet, run=run, any_threads=True)
