@@ -31,6 +31,7 @@ from pydantic import BaseModel, ConfigDict
 from pipeline import threads
 from pipeline.artifacts import Artifact, FileRef, Located
 from pipeline.errors import Cancelled, NeufaceError, stage_error_from_os_error
+from pipeline.memory import give_back
 from pipeline.store import Store
 from pipeline.units import FilledIn
 
@@ -240,6 +241,7 @@ def execute(
             context = Context(partial, scratch, device, progress, checked, log_of, show, checked.waited)
             context.check()
             artifact = stage.run(inputs, config, context)
+            give_back()
             run: dict[str, Any] = {
                 "seconds": round(time.perf_counter() - start - checked.waited(), 3),
                 "peak_memory_mb": peak_memory_mb(),

@@ -7,11 +7,12 @@ itself:
     alpha = <c - B, F - B> / |F - B|^2,     r^2 = |c - B - alpha (F - B)|^2 / |B|^2
 
 Symbols, in linear light: c a pixel's colour; B the background continued into the mask (refine_contour.continued); F the
-mean colour of what differs clearly from B nearby. A pixel of the mask is **mixed** if r is small and F is far from B,
-and a region of mixed pixels with alpha < 1/2 is a gap if what surrounds it is mixed too: hair or wall, but not skin,
-whose colour is no mixture of both. Such pixels of a pale face, an ear beside it or a bald head are connected with skin.
-Gaps lie above the chin and outside of the face. What is left of the hair beside a gap, and is only a few pixels thin,
-goes with it. Without a face in the photo nothing is done.
+mean colour of the hair nearby, which is much darker than B. A pixel of the mask is **mixed** if r is small and F is far
+from B. A region of mixed pixels with alpha < 1/2 is a gap if enough hair is around it, and what touches it is mixed,
+too: hair or wall, but not skin, whose colour is no mixture of both. Such pixels of a pale face, an ear beside it or a
+bald head are connected with skin. Gaps lie above the lips and outside of the face. Hair beside a gap that is left thin
+goes with it. Mixed pixels near the outline with alpha < SOLID remain the subject's, but their colours are not used.
+Without a face in the photo nothing is done. Accuracy: docs/captures.md, Contours.
 """
 
 from __future__ import annotations
