@@ -10,6 +10,7 @@ from pipeline.artifacts import CameraSet, FittedFace, Located, MaskSet
 from pipeline.capture_artifacts import Capture
 from pipeline.contract import Context, Stage
 from pipeline.errors import StageError
+from pipeline.memory import give_back
 from pipeline.together_artifacts import Together
 from stages.inverse_rendering.config import AUTO, MAX_ORDER
 from stages.inverse_rendering.config import Config as Config
@@ -130,6 +131,7 @@ def fit(inputs: Inputs, config: Config, context: Context, other: Other | None) -
     showing = () if ref is None else photos_of_face(inputs.masks.path(ref))
     chosen = choose_start(start, views, landmarks, settings, context.device, context.check, showing)
     start = chosen.start
+    give_back()  # what stereo and depth maps took
     if settings.follow_flow == AUTO:
         settings = settings.changed(follow_flow="on" if chosen.cut_by_template else "off")
     lit = None
