@@ -1,7 +1,7 @@
 """Gives memory that nothing uses any more back to the system.
 
-The C library keeps what is freed for later requests. After a fit it keeps 600 MB, beneath which the next stage's arrays
-do not fit, so that the peak of a run is that of two stages.
+The C library keeps what is freed for later requests: 600 MB after a fit of the scanned head. Large arrays of the next
+stage are mapped beside them.
 """
 
 from __future__ import annotations
