@@ -75,7 +75,7 @@ OF_CAMERAS = (
     Mutation("stages/masks/loose_hair.py", "<= MOST * head.face.sum()", "<= 99 * head.face.sum()", HAIR),
     Mutation("stages/masks/loose_hair.py", "hair & close", "hair", HAIR),
     Mutation("stages/masks/loose_hair.py", "> FAR) &", "> -9) &", HAIR),
-    Mutation("stages/masks/loose_hair.py", "known & far[2] & on_line & told", "known & far[2] & told", HAIR),
+    Mutation("stages/masks/loose_hair.py", "known & near & on_line & told", "known & near & told", HAIR),
     Mutation("stages/masks/loose_hair.py", "(face + step * up)", "(face - step * up)", HAIR),
     Mutation("stages/masks/loose_hair.py", "left & edge &", "left &", HAIR),
     Mutation("stages/masks/loose_hair.py", "(seen.alpha < SOLID)", "(seen.alpha < 0.5)", HAIR),

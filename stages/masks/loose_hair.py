@@ -52,7 +52,7 @@ EDGE = 0.1  # of the face's height: how far from the outline a wall can be seen 
 
 @dataclass(frozen=True, slots=True)
 class Head:
-    """Where gaps may be (h, w), which pixels are the face's (h, w), and the face's height in pixels."""
+    """Where gaps may be (h, w), never in the face; which pixels are the face's (h, w); and its height in pixels."""
 
     above: Bool
     face: Bool
@@ -86,7 +86,7 @@ def with_loose_hair(image: U8, inside: Bool, disc: Disc) -> tuple[Bool, Bool]:
     seen = mixtures(LINEAR[np.asarray(cv2.GaussianBlur(image, (0, 0), BLUR), np.uint8)], inside, head)
     left = inside & ~gaps(inside, seen, head)
     edge = dilated(~left, max(1, round(EDGE * head.height)))
-    return left, left & edge & head.above & ~head.face & seen.mixed & (seen.alpha < SOLID)
+    return left, left & edge & head.above & seen.mixed & (seen.alpha < SOLID)
 
 
 def gaps(inside: Bool, seen: Mixtures, head: Head) -> Bool:
@@ -132,8 +132,7 @@ def mixtures(colour: F32, inside: Bool, head: Head) -> Mixtures:
     background = np.maximum(background, 0)
     behind = _log_luminance(background)
     hair = inside & head.above & known & (behind - _log_luminance(colour) > DARKER)
-    close, far = (mean_near(colour, hair, round(k * head.reach)) for k in (1, 2))
-    foreground = np.where(close[2][..., None], close[0], far[0])
+    foreground, _, near = mean_near(colour, hair, round(head.reach), round(2 * head.reach))
     difference = foreground - background
     square = np.maximum((difference**2).sum(-1), 1e-9)
     off = colour - background
@@ -141,7 +140,7 @@ def mixtures(colour: F32, inside: Bool, head: Head) -> Mixtures:
     rest = off - alpha.clip(0, 1)[..., None] * difference
     on_line = (rest**2).sum(-1) < OFF_LINE**2 * (background**2).sum(-1)
     told = (behind - _log_luminance(foreground) > FAR) & (variance[..., 0] < EVEN**2 * square)
-    return Mixtures(known & far[2] & on_line & told, np.asarray(alpha, np.float32), hair)
+    return Mixtures(known & near & on_line & told, np.asarray(alpha, np.float32), hair)
 
 
 def _log_luminance(colour: F32) -> F32:

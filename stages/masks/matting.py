@@ -60,16 +60,14 @@ def between(image: U8, narrow: Bool, wide: Bool) -> F32:
     if (core | outside).all() or not core.any() or not outside.any():
         return wide.astype(np.float32)
     colour = LINEAR[image]
-    close, far = mean_near(colour, core, NEARBY), mean_near(colour, core, 2 * NEARBY)
-    foreground = np.where(close[2][..., None], close[0], far[0]), np.where(close[2], close[1], far[1]), far[2]
     mean, variance, known = continued(colour, outside, BEHIND)
-    alpha = _blend(colour, foreground, (mean, variance[..., 0], known), wide)
+    alpha = _blend(colour, mean_near(colour, core, NEARBY, 2 * NEARBY), (mean, variance[..., 0], known), wide)
     return np.asarray(np.where(core, 1, np.where(outside, 0, alpha)), np.float32)
 
 
 def _solve(colour: F32, inside: Bool, inner: Bool, outer: Bool, radius: int) -> F32:
-    foreground = mean_near(colour, inner, 2 * radius + 1)
-    alpha = _blend(colour, foreground, mean_near(colour, outer, 2 * radius + 1), inside)
+    foreground = _within(colour, inner, 2 * radius + 1)
+    alpha = _blend(colour, foreground, _within(colour, outer, 2 * radius + 1), inside)
     alpha = np.where(alpha < SNAP, 0, np.where(alpha > 1 - SNAP, 1, alpha))
     return np.asarray(np.where(inner, 1, np.where(outer, 0, alpha)), np.float32)
 
@@ -93,7 +91,14 @@ def _dot(a: F32, b: F32) -> F32:
     return np.asarray(np.einsum("ijk,ijk->ij", a, b), np.float32)
 
 
-def mean_near(colour: F32, where: Bool, reach: int) -> tuple[F32, F32, Bool]:
+def mean_near(colour: F32, where: Bool, reach: int, further: int) -> tuple[F32, F32, Bool]:
+    """Mean colour (H, W, 3) and variance (H, W) of the pixels `where` (H, W) within `reach`, or within `further` where
+    there are none; and whether any exist."""
+    close, far = _within(colour, where, reach), _within(colour, where, further)
+    return np.where(close[2][..., None], close[0], far[0]), np.where(close[2], close[1], far[1]), far[2]
+
+
+def _within(colour: F32, where: Bool, reach: int) -> tuple[F32, F32, Bool]:
     """Mean colour (H, W, 3) and variance (H, W) of the pixels `where` (H, W) within `reach`, and whether any exist."""
     size = (2 * reach + 1, 2 * reach + 1)
     weight = where.astype(np.float32)
