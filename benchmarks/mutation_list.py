@@ -151,7 +151,7 @@ MUTATIONS = (
     Mutation("stages/bake/standard_fit.py", "(found.roughness + trust * v)", "(found.roughness - trust * v)",
              "tests/bake/test_standard_fit.py"),
     Mutation("stages/bake/standard_fit.py", "weight * fitted + (1 - weight) * usual", "(fitted + usual) / 2",
-             "tests/bake/test_standard_fit.py"),
+             "tests/bake/test_mean_f0.py"),
     Mutation("stages/bake/standard_fit.py", "< (1 + FREE) * bare", "< 0.5 * bare", "tests/bake/test_standard_fit.py"),
     Mutation("stages/bake/gloss_field.py", "o * (sums.zy - f0 * sums.xz)", "o * sums.zy",
              "tests/bake/test_gloss_field.py"),

@@ -26,10 +26,12 @@ MIN_EXPLAINED of what changes with the view. Errors of light and shape in A and 
 skin is drawn to USUAL_F0, the more the less the layer explains (`drawn`). Hair that is a mesh of its own is matt: F0 is
 keratin's at most, roughness about HAIR_ROUGHNESS, and without evidence there is no layer. Everything else has no prior
 for F0, and then no layer, except that an object without a person has ASSUMED_F0 at the largest roughness if that costs
-nothing in the photos (FREE): no dielectric has F0 0. There is no layer where F0 would be above DIELECTRIC: the light
-moved then, as a flash does, or the photos are clipped. An object without any other material keeps the one that is read
-off NeuFace's lobe. At last r follows by linear least squares, pooled over EDGES edges, on skin drawn to 1 with the
-weight FIELD: the exported light is up to 5 % of the irradiance off the fitted one.
+nothing in the photos (FREE): no dielectric has F0 0. Where a layer is explained by its rim alone, F0 comes out at 0 by
+the same attenuation: such a group has LEAST_F0, or less if that cost more than FREE of the error that is left
+(`at_least`). There is no layer where F0 would be above DIELECTRIC: the light moved then, as a flash does, or the photos
+are clipped. An object without any other material keeps the one that is read off NeuFace's lobe. At last r follows by
+linear least squares, pooled over EDGES edges, on skin drawn to 1 with the weight FIELD: the exported light is up to 5 %
+of the irradiance off the fitted one.
 """
 
 from __future__ import annotations
@@ -64,8 +66,9 @@ MIN_EXPLAINED = 0.05  # share of the view-dependent variance that a layer must e
 MIN_VERTICES, MIN_VIEWS = 50, 4
 GRAZING, FACING = 0.2, 0.4  # cosines between which an observation's weight rises from 0 to 1
 OUTLIER = 2.5  # robust standard deviations of the field's residual from which the weight falls
+LEAST_F0 = 0.02  # of a dielectric: water, index 1.33
 ASSUMED_F0 = 0.04  # of bone, stone, paint: index 1.5
-FREE = 0.02  # largest share of the view-dependent variance that an assumed layer may cost
+FREE = 0.02  # largest share of the view-dependent variance that an F0 which photos do not tell may cost
 FIELD = 1 / 3  # weight of the fit's own albedo of skin, r = 1, beside that of the photos under the exported light
 DIELECTRIC = 0.17  # F0 of diamond, the largest of a dielectric that is common
 TYPICAL_F0 = 0.03  # for R while F0 is estimated: R's part with F0 is 3 % of the base
@@ -303,16 +306,27 @@ def _group(sums: _Sums, own: Mask, prior: Prior) -> _Group:
     if mean[k] > prior.most:
         return _Group(0.0, 0.0, prior.roughness, explained, refused=float(mean[k]))
     rough, fitted = _lowest(np.sqrt(ALPHAS).astype(np.float64), cost), float(mean[k])
-    f0 = float(np.clip(drawn(fitted, prior.usual, explained), *prior.f0)) if prior.usual else fitted
+    told = precision_share(np.sqrt(ALPHAS), cost, prior.spread)
+    if prior.usual:
+        f0 = float(np.clip(drawn(fitted, prior.usual, explained), *prior.f0))
+        return _Group(f0, fitted, rough, explained, measured=True, told=(weight_of(explained), told))
+    f0 = at_least(fitted, float(g[k] / h[k]), FREE * float(error[k] / h[k]))
     if f0 <= 0:
         return _Group(f0, fitted, rough, explained)
-    told = (weight_of(explained) if prior.usual else 1.0, precision_share(np.sqrt(ALPHAS), cost, prior.spread))
-    return _Group(f0, fitted, rough, explained, measured=True, told=told)
+    # where F0 is raised, the photos tell a layer and its roughness, and of F0 only that it is small
+    return _Group(f0, f0, rough, explained, measured=True, told=(fitted / f0, told))
 
 
 def _is_free(f0: float, h: float, g: float, q: float, bare: float) -> bool:
     """Whether the photos allow the roughest layer of this F0: matt bone, stone and paint have one as well."""
     return q - 2 * f0 * g + f0**2 * h < (1 + FREE) * bare
+
+
+def at_least(fitted: float, best: float, free: float) -> float:
+    """Mean F0 of a material without a usual one: `fitted`, the regression's (>= 0), but LEAST_F0 where it is below and
+    photos allow it: (F0 - best)^2 <= (fitted - best)^2 + free. best: F0 of the least error, of any sign; free: FREE of
+    the error that is left, over H (>= 0)."""
+    return max(fitted, min(LEAST_F0, best + float(np.hypot(fitted - best, np.sqrt(free)))))
 
 
 def drawn(fitted: float, usual: float, explained: float) -> float:
