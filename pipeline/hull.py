@@ -25,7 +25,7 @@ from scipy import ndimage
 from pipeline.artifacts import Camera
 from pipeline.errors import StageError
 from pipeline.pieces import subject_pieces
-from pipeline.silhouettes import Silhouette, lens_radius, outside, silhouette
+from pipeline.silhouettes import Stack, lens_radius, silhouette, stack
 from pipeline.transforms import inverse_rigid, matrix, project
 
 F32 = npt.NDArray[np.float32]
@@ -93,7 +93,7 @@ def visual_hull(
     """
     lo, hi = np.asarray(lo, np.float64), np.asarray(hi, np.float64)
     shape = _grid_shape(lo, hi, cell, len(cameras), len(alphas))
-    views = [silhouette(c, a, 0.5 * (lo + hi), cell) for c, a in zip(cameras, alphas, strict=True)]
+    views = stack([silhouette(c, a, 0.5 * (lo + hi), cell) for c, a in zip(cameras, alphas, strict=True)])
     band = BAND_CELLS * cell
     coarsest = 4 if min(shape) >= 16 else 1
     level: F32 = np.zeros(tuple(-(-n // coarsest) for n in shape), np.float32)
@@ -153,7 +153,7 @@ def _doubled(array: npt.NDArray[S], shape: tuple[int, ...]) -> npt.NDArray[S]:
 
 
 def _consult(
-    views: list[Silhouette], points: F64, reach: float, band: float, rule: tuple[int, int, float]
+    views: Stack, points: F64, reach: float, band: float, rule: tuple[int, int, float]
 ) -> tuple[F32, npt.NDArray[np.int16], Bool]:
     """Level (N,) clamped to the band, number of views that see the point (N,), and whether the sign of the level holds
     for everything within `reach` (N,)."""
@@ -165,24 +165,18 @@ def _consult(
 
 
 def _consult_chunk(
-    views: list[Silhouette], points: F64, reach: float, band: float, rule: tuple[int, int, float]
+    views: Stack, points: F64, reach: float, band: float, rule: tuple[int, int, float]
 ) -> tuple[F32, npt.NDArray[np.int16], Bool]:
+    from pipeline.silhouette_kernels import largest_outside
+
     min_views, max_outside, share = rule
     n, far = len(points), reach + band
     # largest levels first, over the views that see the whole neighbourhood, and over those that may see a part of it
     sure = np.full((max_outside + 1, n), -np.inf, np.float32)
     maybe = sure.copy() if reach else sure
     seen, glimpsed = np.zeros(n, np.int16), np.zeros(n, np.int16)
-    live = np.arange(n)
-    for i, view in enumerate(views):
-        value, whole, part = outside(view, points[live], reach)
-        seen[live] += whole
-        glimpsed[live] += part
-        _insert(sure, live, np.where(whole, value, -np.inf))
-        if reach:
-            _insert(maybe, live, np.where(part, value, -np.inf))
-        if i % 4 == 3:  # already carved: no other view can change that
-            live = live[sure[-1, live] <= far]
+    largest_outside(points, views.views, views.shapes, views.starts, views.distances, reach, np.float32(far), sure,
+                    maybe, seen, glimpsed)  # fmt: skip
     lenient, column = np.minimum(max_outside, (share * seen).astype(np.intp)), np.arange(n)
     level = sure[lenient, column]
     carved = sure[np.minimum(max_outside, (share * glimpsed).astype(np.intp)), column] > far
@@ -190,15 +184,6 @@ def _consult_chunk(
     inside = (maybe[lenient, column] < -far) & (seen >= min_views)
     clamped = np.where(unseen, band, level.clip(-band, band)).astype(np.float32)
     return clamped, seen, carved | unseen | inside
-
-
-def _insert(top: F32, at: npt.NDArray[np.intp], value: npt.NDArray[np.floating]) -> None:
-    """Insert `value` into rows of `top`, which are sorted in descending order, and drop the smallest."""
-    value = value.astype(np.float32)
-    for row in top:
-        old = row[at]
-        row[at] = np.maximum(old, value)
-        value = np.minimum(old, value)
 
 
 # ------------------------------------------------------------------ functions of a hull

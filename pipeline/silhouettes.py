@@ -5,6 +5,7 @@ A pixel belongs to the subject where alpha >= 0.5; the soft alpha gives the cont
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +13,7 @@ import numpy.typing as npt
 from scipy import special
 
 from pipeline.artifacts import Camera
-from pipeline.transforms import inverse_rigid, matrix, project, undistort
+from pipeline.transforms import inverse_rigid, matrix, undistort
 
 F32 = npt.NDArray[np.float32]
 F64 = npt.NDArray[np.float64]
@@ -114,29 +115,37 @@ def _to_other_side(beyond: F32, other: Bool) -> F32:
     return np.asarray(np.maximum(distance - of_label[label], 0), np.float32)
 
 
+@dataclass(frozen=True, slots=True)
+class Stack:
+    """Silhouettes as the compiled loops take them (silhouette_kernels)."""
+
+    views: F64
+    shapes: npt.NDArray[np.int64]
+    starts: npt.NDArray[np.int64]
+    distances: F32
+
+
+def stack(views: Sequence[Silhouette]) -> Stack:
+    """Of all views together."""
+    numbers = [[*v.cam_from_world[:3].ravel(), *v.K[:2].ravel(), *v.distortion, v.focal, v.width, v.height,
+                v.radius if np.any(v.distortion) else np.inf] for v in views]  # fmt: skip
+    sizes = [v.distance.size for v in views]
+    return Stack(
+        np.array(numbers, np.float64),
+        np.array([v.distance.shape for v in views], np.int64),
+        np.concatenate([[0], np.cumsum(sizes)[:-1]]).astype(np.int64),
+        np.concatenate([v.distance.ravel() for v in views]).astype(np.float32),
+    )
+
+
 def outside(view: Silhouette, points: F64, reach: float) -> tuple[F32, Bool, Bool]:
     """Distance (N,) of points (N, 3) outside the silhouette, asset units; whether the view sees all within `reach`
     (N,); whether it sees any of it (N,)."""
-    uv, z = project(view.K, view.cam_from_world, view.distortion, points)
-    front = z > 1e-9
-    uv = np.where(front[:, None], uv, -1e9)
-    z = np.where(front, z, 1.0)
-    if np.any(view.distortion):
-        flat = points @ view.cam_from_world[:2, :3].T + view.cam_from_world[:2, 3]
-        front &= np.hypot(flat[:, 0], flat[:, 1]) < view.radius * z + reach
-    margin = reach * view.focal / z
-    left = np.minimum(uv, np.array([view.width, view.height]) - uv).min(1)  # distance to the nearest edge of the frame
-    value = _lookup(view.distance, uv / (view.width, view.height)) * (z / view.focal)
-    return value.astype(np.float32), front & (left >= margin), front & (left > -margin if reach else left >= 0)
+    from pipeline.silhouette_kernels import outside_one
 
-
-def _lookup(image: F32, at: F64) -> F32:
-    """Bilinear values (N,) of (H, W) at positions (N, 2) in [0, 1] (right, down), clamped to the outermost pixels."""
-    h, w = image.shape
-    x = (at[:, 0] * w - 0.5).clip(0, w - 1.001)
-    y = (at[:, 1] * h - 0.5).clip(0, h - 1.001)
-    c, r = x.astype(np.int32), y.astype(np.int32)
-    fx, fy = (x - c).astype(np.float32), (y - r).astype(np.float32)
-    flat, k = image.ravel(), r * w + c
-    top = flat[k] * (1 - fx) + flat[k + 1] * fx
-    return np.asarray(top * (1 - fy) + (flat[k + w] * (1 - fx) + flat[k + w + 1] * fx) * fy, np.float32)
+    one, n = stack([view]), len(points)
+    value, whole, part = np.empty(n, np.float32), np.empty(n, bool), np.empty(n, bool)
+    rows, columns = (int(k) for k in one.shapes[0])
+    outside_one(np.asarray(points, np.float64), one.views[0], rows, columns, one.distances, float(reach), value, whole,
+                part)  # fmt: skip
+    return value, whole, part

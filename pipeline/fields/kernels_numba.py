@@ -241,7 +241,10 @@ def hash_forward(table, offset, size, hashed, mask, lo, inv, x, out):
 @njit(parallel=True, error_model="numpy", cache=True)
 def hash_backward(table, offset, size, hashed, mask, lo, inv, x, grad_out, grad_table, grad_x):
     """Gradients of the table (added) and of x, (L, N, 3) to be summed over levels. Levels own disjoint table rows."""
-    for level in prange(offset.shape[0]):
+    levels = offset.shape[0]
+    for p in prange(levels):
+        half = (levels + 1) // 2
+        level = 2 * p if p < half else 2 * (p - half) + 1  # coarse levels are faster, and each thread gets some
         for n in range(x.shape[0]):
             ux, uy, uz = (
                 (x[n, 0] - lo[0]) * inv[level],
