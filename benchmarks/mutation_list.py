@@ -135,6 +135,12 @@ MUTATIONS = (
              "tests/masks/test_masks_refine_contour.py::test_a_contour_that_is_nearly_right_becomes_right"),
     Mutation("stages/masks/face_labels.py", "(out > 0) & (out != EYES)", "(out > 0)",
              "tests/masks/test_masks_faces.py"),
+    Mutation("pipeline/silhouette_kernels.py", "front and left >= margin", "left >= margin",
+             "tests/pipeline/test_silhouette_kernels.py"),
+    Mutation("pipeline/silhouette_kernels.py", "< view[26] * depth + reach", "< view[26] * depth",
+             "tests/pipeline/test_silhouette_kernels.py"),
+    Mutation("pipeline/silhouette_kernels.py", "value = min(old, value)", "value = old",
+             "tests/pipeline/test_silhouette_kernels.py"),
     Mutation("pipeline/hull.py", "1.2 * np.sqrt(3) / 2 * cell * factor", "0.2 * cell * factor",
              "tests/pipeline/test_hull.py::test_coarse_to_fine_equals_every_voxel_asked"),
     # ---------------------------------------------------------------- UVs and maps
