@@ -186,14 +186,29 @@ def sample_directions(normal: F64, to_eye: F64, f0: F64, a: F64, shift: F64, poi
     return diffuse, specular, weight
 
 
-@compiled
 def shade(normal: F64, to_eye: F64, albedo: F64, f0: F64, a: F64, shift: F64, points: F64, table: F32) -> F64:
     """Unshadowed radiance (N, 3) towards the eye, with the net `points` (S, 2) for each lobe.
 
     `normal`, `to_eye`, `albedo` (N, 3); `f0`, `a` (N,); `shift` (N, 2); `table` as from `cube_table`.
     """
+    diffuse, specular = sums(normal, to_eye, f0, a, shift, points, table)
+    return np.asarray((albedo * diffuse + specular) / len(points))
+
+
+def shade_apart(
+    normal: F64, to_eye: F64, albedo: F64, f0: F64, a: F64, shift: F64, points: F64, table: F32
+) -> tuple[F64, F64]:
+    """The diffuse and the specular part (N, 3) of `shade`."""
+    diffuse, specular = sums(normal, to_eye, f0, a, shift, points, table)
+    return np.asarray(albedo * diffuse / len(points)), np.asarray(specular / len(points))
+
+
+@compiled
+def sums(normal: F64, to_eye: F64, f0: F64, a: F64, shift: F64, points: F64, table: F32) -> tuple[F64, F64]:
+    """Sums over the net of the light of diffuse samples, and of the weighted light of specular ones, (N, 3) each;
+    arguments as of `shade`."""
     count, samples = normal.shape[0], points.shape[0]
-    out = np.empty((count, 3))
+    diffuse, specular = np.empty((count, 3)), np.empty((count, 3))
     cos, sin = np.cos(2.0 * math.pi * points[:, 1]), np.sin(2.0 * math.pi * points[:, 1])
     for i in range(count):
         t, b, n, wo = local_frame(normal[i], to_eye[i])
@@ -213,10 +228,9 @@ def shade(normal: F64, to_eye: F64, albedo: F64, f0: F64, a: F64, shift: F64, po
                 wx, wy, wz = to_world(t, b, n, x, y, z)
                 red, green, blue = look_up(table, wx, wy, wz)
                 sr, sg, sb = sr + weight * red, sg + weight * green, sb + weight * blue
-        out[i, 0] = (albedo[i, 0] * dr + sr) / samples
-        out[i, 1] = (albedo[i, 1] * dg + sg) / samples
-        out[i, 2] = (albedo[i, 2] * db + sb) / samples
-    return out
+        diffuse[i, 0], diffuse[i, 1], diffuse[i, 2] = dr, dg, db
+        specular[i, 0], specular[i, 1], specular[i, 2] = sr, sg, sb
+    return diffuse, specular
 
 
 @compiled

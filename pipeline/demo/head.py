@@ -34,6 +34,7 @@ from pipeline.demo.shapes import (
     turned,
     wrapped,
 )
+from pipeline.threads import side_by_side
 
 BOUNDS: F64 = np.array([[-0.1043, -0.1807, -0.1249], [0.1057, 0.1349, 0.1353]])
 """Corners (2, 3) of a box that holds the whole head, metres; odd, so that no grid node meets a flat face."""
@@ -76,7 +77,9 @@ _BLOCK = 4096  # points at a time: the temporaries then stay in the processor's 
 def signed_distance(points: F64) -> F64:
     """Signed distance (N,) in metres at `points` (N, 3)."""
     p = np.ascontiguousarray(points.T) * _MM
-    blocks = [_sculpture(p[:, i : i + _BLOCK], False).value for i in range(0, p.shape[1], _BLOCK)]
+    blocks = list(side_by_side(
+        lambda i: _sculpture(p[:, i : i + _BLOCK], False).value, range(0, p.shape[1], _BLOCK)
+    ))  # fmt: skip
     return np.concatenate(blocks) / _MM if blocks else np.zeros(0)
 
 

@@ -193,3 +193,24 @@ def test_single_samples_add_up_to_the_fused_loop(table: F32) -> None:
         total += weight[:, None] * brdf.look_up_many(table, specular)
     fused = brdf.shade(normal, to_eye, albedo, f0, width, shift, net, table)
     np.testing.assert_allclose(total / 16, fused, rtol=1e-6)
+
+
+def test_both_parts_add_up_to_the_radiance(table: F32) -> None:
+    rng = np.random.default_rng(6)
+    normal = np.tile([0.0, 0.0, 1.0], (20, 1))
+    to_eye = normal + 0.5 * rng.normal(size=(20, 3))
+    to_eye /= np.linalg.norm(to_eye, axis=1, keepdims=True)
+    albedo, f0, width, shift = rng.random((20, 3)), np.full(20, 0.04), np.full(20, 0.2), rng.random((20, 2))
+    rest = normal, to_eye, f0, width, shift
+    net = qmc.Sobol(2, scramble=False).random(16)
+
+    def of(albedo: F64, f0: F64) -> tuple[F64, F64, F64]:
+        given = rest[0], rest[1], albedo, f0, *rest[3:], net, table
+        return brdf.shade(*given), *brdf.shade_apart(*given)
+
+    whole, diffuse, specular = of(albedo, f0)
+    np.testing.assert_allclose(diffuse + specular, whole, rtol=1e-12)
+    np.testing.assert_allclose(of(np.zeros_like(albedo), f0)[0], specular, rtol=1e-12)
+    black, white = of(albedo, np.zeros_like(f0)), of(albedo, np.ones_like(f0))
+    np.testing.assert_allclose(black[1], diffuse, rtol=1e-12)  # the lobes are not coupled
+    assert (white[2] > specular).all() and (specular > black[2]).all()

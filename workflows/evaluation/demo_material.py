@@ -20,11 +20,13 @@ import numpy.typing as npt
 
 from pipeline.capture_artifacts import Capture, CaptureView
 from pipeline.images import read_alpha, write_png_from_linear
+from pipeline.threads import side_by_side
 from pipeline.transforms import apply, pixel_centres, scale_of
 
 F64 = npt.NDArray[np.float64]
 SAMPLES = 256  # light samples of each lobe at a pixel
 CHUNK = 200_000
+SHADED = 5_000  # points that one thread shades at a time
 SPHERE = 4000  # directions in which lights are compared
 
 
@@ -168,11 +170,17 @@ def true_looks(folder: Path, points: F64, normals: F64, to_eye: F64) -> Looks:
     look = skin.material(points, seed_of(folder))
     net = np.asarray(qmc.Sobol(2, scramble=False).random(SAMPLES), np.float64)
     shift = np.random.default_rng(0).random((len(points), 2))
-    black = np.zeros_like(look.albedo)
     width = look.roughness**2
-    both = brdf.shade(normals, to_eye, look.albedo, look.f0, width, shift, net, table)
-    specular = brdf.shade(normals, to_eye, black, look.f0, width, shift, net, table)
-    return Looks(look.albedo, look.f0, look.roughness, both - specular, specular)
+
+    def shaded(i: int) -> tuple[F64, F64]:
+        some = slice(i, i + SHADED)
+        return brdf.shade_apart(
+            normals[some], to_eye[some], look.albedo[some], look.f0[some], width[some], shift[some], net, table
+        )
+
+    parts = list(side_by_side(shaded, range(0, max(len(points), 1), SHADED)))
+    diffuse, specular = (np.concatenate(part) for part in zip(*parts, strict=True))
+    return Looks(look.albedo, look.f0, look.roughness, diffuse, specular)
 
 
 def fitted_looks(model: Any, points: F64, to_eye: F64, capture_from_asset: F64) -> Looks:
