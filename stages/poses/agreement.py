@@ -12,7 +12,7 @@ What right and wrong poses had on real and made-up captures: docs/stages/poses.m
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
@@ -52,6 +52,10 @@ class Judged:
     features: Features
     size: tuple[int, int]
     number: int
+    tree: cKDTree = field(init=False)  # of the features' pixels
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "tree", cKDTree(self.features.uv))
 
     def uv(self, matches: I64) -> F64:
         """(L, 2) pixels of the features in the first column of `matches`."""
@@ -82,43 +86,49 @@ class Points:
         enough = self.model.track - own >= MIN_OTHERS
         return [(j, self.model.seen[j][enough[self.model.seen[j][:, 1]]]) for j in others[:NEAREST]]
 
-    def matches(self, photo: Judged, pose: Pose, limit: float, shift: tuple[float, float] = (0.0, 0.0)) -> I64:
+    def matches(self, photo: Judged, pose: Pose, limit: float) -> I64:
         """(L, 2) features of the photo and points of the model that lie within `limit` pixels of each other at this
-        pose, look alike, and are mutual nearest. shift: pixels by which the points are displaced."""
+        pose, look alike, and are mutual nearest."""
+        return self._matched(photo, self._projected(photo, pose), limit, (0.0, 0.0))
+
+    def agreement(self, photo: Judged, pose: Pose) -> Agreement:
+        """Of this photo with a camera at this pose, by points that it has no part in."""
+        edge, projected = max(photo.size), self._projected(photo, pose)
+        counts = [_spots(photo.features, self._matched(photo, projected, LIMIT * edge, (x * edge, y * edge)), edge)
+                  for x, y in ((0.0, 0.0), *SHIFTS)]  # fmt: skip
+        return Agreement(counts[0], float(np.mean(counts[1:])))
+
+    def _projected(self, photo: Judged, pose: Pose) -> list[tuple[int, I64, F64]]:
+        """What `seen_near` gives, with the points' pixels (L, 2) in the photo, NaN behind the camera."""
+        lens = pose.K, inverse_rigid(pose.world_from_cam), np.array(pose.distortion)
+        near = self.seen_near(pose, photo.number)
+        return [(j, seen, project(*lens, self.model.points[seen[:, 1]])[0]) for j, seen in near]
+
+    def _matched(
+        self, photo: Judged, projected: Sequence[tuple[int, I64, F64]], limit: float, shift: tuple[float, float]
+    ) -> I64:
+        """As `matches`, with the points displaced by `shift` pixels; those that leave the picture have no match."""
         found = [np.zeros((0, 2), np.int64)]
-        for j, seen in self.seen_near(pose, photo.number):
-            rows, own = _within(self._visible(photo, pose, seen[:, 1], shift), photo.features.uv, limit)
+        for j, seen, uv in projected:
+            moved = uv + np.array(shift)
+            inside = ((moved >= 0) & (moved < photo.size)).all(1)
+            rows, own = _within(np.where(inside[:, None], moved, np.inf), photo.tree, limit)
             alike = np.einsum("nd,nd->n", self.features[j].descriptors[seen[rows, 0]], photo.features.descriptors[own])
             kept = _mutual(rows, own, alike) & (alike >= 1 - ALIKE**2 / 2)
             found.append(np.stack([own[kept], seen[rows[kept], 1]], 1))
         return np.unique(np.concatenate(found), axis=0)
 
-    def agreement(self, photo: Judged, pose: Pose) -> Agreement:
-        """Of this photo with a camera at this pose, by points that it has no part in."""
-        edge = max(photo.size)
-        counts = [_spots(photo.features, self.matches(photo, pose, LIMIT * edge, (x * edge, y * edge)), edge)
-                  for x, y in ((0.0, 0.0), *SHIFTS)]  # fmt: skip
-        return Agreement(counts[0], float(np.mean(counts[1:])))
 
-    def _visible(self, photo: Judged, pose: Pose, points: I64, shift: tuple[float, float]) -> F64:
-        """(L, 2) pixels of these points, displaced; infinite outside of the picture and behind the camera."""
-        uv, _ = project(
-            pose.K, inverse_rigid(pose.world_from_cam), np.array(pose.distortion), self.model.points[points]
-        )
-        moved = uv + np.array(shift)
-        inside = ((moved >= 0) & (moved < photo.size)).all(1)
-        return np.where(inside[:, None], moved, np.inf)
-
-
-def _within(a: F64, b: npt.NDArray[np.floating], limit: float) -> tuple[I64, I64]:
-    """Indices (K,) of all pairs of a (N, 2) and b (M, 2) that are within `limit` of each other; infinite rows have
-    none."""
+def _within(a: F64, tree: cKDTree, limit: float) -> tuple[I64, I64]:
+    """Indices (K,), in ascending order, of all pairs of a (N, 2) and of the tree's points (M, 2) that are within
+    `limit` of each other; infinite rows have none."""
     finite = np.nonzero(np.isfinite(a).all(1))[0]
-    if not len(finite) or not len(b):
+    if not len(finite) or not tree.n:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
-    near = cKDTree(b).query_ball_point(a[finite], limit)
-    rows = np.repeat(finite, [len(n) for n in near])
-    return rows, np.array([i for n in near for i in n], np.int64)
+    pairs = cKDTree(a[finite]).sparse_distance_matrix(tree, limit, output_type="ndarray")
+    rows, columns = finite[pairs["i"]], np.asarray(pairs["j"], np.int64)
+    order = np.lexsort((columns, rows))
+    return rows[order], columns[order]
 
 
 def _mutual(rows: I64, columns: I64, alike: npt.NDArray[np.floating]) -> npt.NDArray[np.bool_]:

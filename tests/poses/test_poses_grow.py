@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from stages.poses import search
 from stages.poses.agreement import SHIFTS, Agreement, Judged, Points, _mutual, _within
@@ -38,15 +39,15 @@ def test_pairs_within_a_distance_and_mutual_nearest_are_those_of_the_full_matrix
     rng = np.random.default_rng(3)
     a, b = rng.uniform(0, 30, (80, 2)), rng.uniform(0, 30, (120, 2))
     a[7] = np.inf
-    rows, columns = _within(a, b, 3.0)
+    rows, columns = _within(a, cKDTree(b), 3.0)
     full = np.linalg.norm(a[:, None] - b[None], axis=2) <= 3.0
     assert set(zip(rows.tolist(), columns.tolist(), strict=True)) == set(zip(*np.nonzero(full), strict=True))
     alike = np.where(full, rng.random(full.shape), -1)
     kept = _mutual(rows, columns, alike[rows, columns])
     best = {(i, int(j)) for i, j in enumerate(alike.argmax(1)) if alike[i, j] >= 0 and alike[:, j].argmax() == i}
     assert set(zip(rows[kept].tolist(), columns[kept].tolist(), strict=True)) == best
-    assert [len(x) for x in _within(a, np.zeros((0, 2)), 3.0)] == [0, 0]
-    assert [len(x) for x in _within(np.full((3, 2), np.inf), b, 3.0)] == [0, 0]
+    assert [len(x) for x in _within(a, cKDTree(np.zeros((0, 2))), 3.0)] == [0, 0]
+    assert [len(x) for x in _within(np.full((3, 2), np.inf), cKDTree(b), 3.0)] == [0, 0]
 
 
 def test_the_score_is_in_deviations_above_chance() -> None:
