@@ -11,8 +11,8 @@ import gc
 
 
 def give_back() -> None:
-    """Collect what is unreachable, and return free pages; where the C library is not glibc, only the former. Takes some
-    hundredths of a second."""
+    """Collect what is unreachable, and return free pages; where the C library is not glibc, only the former. Takes
+    a fifth of a second."""
     gc.collect()
     try:
         trim = ctypes.CDLL(None).malloc_trim
