@@ -3,8 +3,8 @@
 At the mesh's vertices, each in [0, 1]:
 
     base colour  1 - share that was replaced by its region's colour (unseen.py); 0 where no photo sees the place
-    F0           share of the photos in the mean F0 of the place's material (standard_fit.drawn), 0 where the layer is
-                 a prior's; 0 where fewer than MIN_VIEWS photos see the place, which then follows its neighbours
+    F0           share of the photos in the mean F0 of the place's material (standard_fit.drawn, at_least), 0 where the
+                 layer is a prior's; 0 where fewer than MIN_VIEWS photos see the place, which follows its neighbours
     roughness    share of the photos in the precision of the material's roughness, likewise
 
 Without fitted standard shaders F0 and roughness are those of NeuFace's lobe: 1 where a photo sees the place. Under a
