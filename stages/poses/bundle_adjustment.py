@@ -19,7 +19,6 @@ from pipeline.transforms import F64
 ROBUST = 2.0  # c / s: a smaller value ignores good matches, a larger one gives outliers weight
 MIN_SCALE = 0.1  # pixels, lower limit of s: matches of synthetic data may be exact
 TOLERANCE = 1e-6  # of the cost: with a tenth of it, cameras move by less than a hundredth of their error
-ROUGH = 1e-4  # of the cost, where the matches are made anew after it: in 2.5 times less time
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,11 +30,9 @@ class Refine:
     principal_point: Literal["auto", "yes", "no"] = "auto"
 
 
-def adjust(reconstruction: Any, refine: Refine, *, principal_point: bool, tolerance: float = TOLERANCE) -> None:
-    """Refine poses, points and the chosen parameters of the lenses, robustly. In place. tolerance: relative change of
-    the cost at which it ends."""
+def adjust(reconstruction: Any, refine: Refine, *, principal_point: bool) -> None:
+    """Refine poses, points and the chosen parameters of the lenses, robustly. In place."""
     options, config, _ = _problem(reconstruction)
-    options.ceres.solver_options.function_tolerance = tolerance
     options.refine_focal_length, options.refine_extra_params = refine.focal, refine.distortion
     options.refine_principal_point = principal_point
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)

@@ -50,9 +50,8 @@ class Growth:
     matches: dict[Pair, Verified] = field(default_factory=dict)
     added: set[int] = field(default_factory=set)
 
-    def rematched(self, model: Model, last: bool = False) -> Model:
-        """The model from guided matches of its photos; as it was if these give no points, or lose a photo. last: no
-        photo is added any more, and all cameras come from narrow bands already: these matches and cameras stay.
+    def rematched(self, model: Model, rounds: int = 1) -> Model:
+        """The model from guided matches of its photos; as it was if these give no points, or lose a photo.
 
         Matches of added photos are made anew in narrowing bands: in a narrow one around a line that is pixels off, only
         wrong matches are found, and these confirm the camera.
@@ -60,12 +59,12 @@ class Growth:
         wanted = near_pairs(model.poses)
         uncertain = [p for p in wanted if self.added & set(p)]
         self._match(model, [p for p in wanted if p not in self.matches and not self.added & set(p)])
-        for widened in WIDENED if uncertain and not last else WIDENED[-1:]:
+        for widened in WIDENED if uncertain else WIDENED[-1:]:
             self._match(model, uncertain, widened)
             self.tick("refining cameras")
             found = reconstructed(
                 model, self.photos, self.features, {p: self.matches[p] for p in wanted if p in self.matches},
-                self.config.camera_model, self.scratch / "rematch", self.config.seed, LAST_ROUNDS if last else 1, last,
+                self.config.camera_model, self.scratch / "rematch", self.config.seed, rounds,
             )  # fmt: skip
             model = model if found is None or set(found.poses) != set(model.poses) else found
         return model
@@ -158,7 +157,7 @@ def grown(
         model = own.rematched(replace(model, poses=dict(sorted({**model.poses, **found}.items()))))
     if len(model.poses) == before:
         return None
-    return only_of_three(checked(own.rematched(model, last=True), photos, sets, progress))
+    return only_of_three(checked(own.rematched(model, LAST_ROUNDS), photos, sets, progress))
 
 
 def _links(own: Growth, of: FeatureSet, missing: Sequence[int]) -> dict[Pair, Verified]:

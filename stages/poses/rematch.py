@@ -13,7 +13,7 @@ import numpy as np
 
 from pipeline.colmap import pycolmap
 from pipeline.transforms import inverse_rigid
-from stages.poses.bundle_adjustment import ROUGH, TOLERANCE, Refine, adjust
+from stages.poses.bundle_adjustment import Refine, adjust
 from stages.poses.detect import Photo
 from stages.poses.features import Features
 from stages.poses.known_poses import with_points, with_poses
@@ -26,13 +26,12 @@ ROUNDS = 2  # of triangulation and bundle adjustment: the second has the points 
 
 def reconstructed(
     model: Model, photos: Sequence[Photo], features: Sequence[Features], matches: Mapping[Pair, Verified],
-    camera_model: str, scratch: Path, seed: int, rounds: int = ROUNDS, last: bool = True,
+    camera_model: str, scratch: Path, seed: int, rounds: int = ROUNDS,
 ) -> Model | None:  # fmt: skip
     """Points from these matches at the model's cameras, then cameras and points refined; None if there are no points.
 
     Photos whose cameras have the same lens in `model` keep a common one. scratch: a folder that does not exist yet.
-    rounds: of triangulation and bundle adjustment. last: whether these cameras stay; else all rounds are rough, and
-    not only those before the last.
+    rounds: of triangulation and bundle adjustment.
     """
     pycolmap.logging.minloglevel = GLOG_ERROR
     scratch.mkdir(parents=True)
@@ -43,11 +42,11 @@ def reconstructed(
         poses = {name: inverse_rigid(model.poses[i].world_from_cam)[:3] for name, i in numbers.items()
                  if i in model.poses}  # fmt: skip
         cameras = None
-        for left in reversed(range(rounds)):
+        for _ in range(rounds):
             found = with_points(with_poses(database, poses, cameras), database, scratch, LIMIT, seed)
             if not found.num_points3D():
                 return None
-            adjust(found, Refine(), principal_point=False, tolerance=ROUGH if left or not last else TOLERANCE)
+            adjust(found, Refine(), principal_point=False)
             poses = {i.name: np.asarray(i.cam_from_world().matrix()) for i in found.images.values() if i.has_pose}
             cameras = dict(found.cameras)
         return replace(model_of(found, numbers), others=model.others)

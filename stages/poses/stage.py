@@ -46,4 +46,4 @@ def run(inputs: Inputs, config: Config, context: Context) -> CameraSet:
     return found.model_copy(update={"seen_directions": seen, "findings": found.findings + findings})
 
 
-STAGE = Stage(name="poses", version=12, inputs=Inputs, config=Config, output=CameraSet, run=run, any_threads=True)
+STAGE = Stage(name="poses", version=11, inputs=Inputs, config=Config, output=CameraSet, run=run, any_threads=True)

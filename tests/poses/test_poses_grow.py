@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from stages.poses import grow, search
+from stages.poses import search
 from stages.poses.agreement import SHIFTS, Agreement, Judged, Points, _mutual, _within
 from stages.poses.config import Config
 from stages.poses.feature_sets import FeatureSet, concatenated, matched
 from stages.poses.features import DENOISED, PLAIN, Features
-from stages.poses.grow import FEWEST_PHOTOS, LAST_ROUNDS, WIDENED, Growth, checked, grown, only_of_three
+from stages.poses.grow import FEWEST_PHOTOS, Growth, checked, grown, only_of_three
 from stages.poses.mapper import Model, Pose
-from stages.poses.matching import Pair, Verified
+from stages.poses.matching import Verified
 from stages.poses.place import ACCEPTED, KEPT, LEAST, place
 from stages.poses.register import Lens, register, sightings
 from tests.support.posed_points import BENT, SIZE, K, World, apart, moved, world
@@ -175,26 +175,6 @@ def test_an_added_photo_that_is_pixels_off_comes_back(tmp_path: Path) -> None:
         return max(abs(apart(found.poses[2], found.poses[i])[1] - apart(own.poses[2], own.poses[i])[1]) for i in (1, 3))
 
     assert off({2}) < off(set()) / 2
-
-
-def test_the_last_pass_is_narrow_and_exact(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Cameras between matches need not be exact; when they stay, their matches are not looked for far away."""
-    own, asked, bands = world([12.0 * i for i in range(4)]), [], []
-
-    def noted(*args: object) -> None:
-        asked.append(args[-2:])
-
-    def matched(*args: object) -> dict[Pair, Verified]:
-        bands.append(args[-1])
-        return {}
-
-    monkeypatch.setattr(grow, "reconstructed", noted)
-    monkeypatch.setattr(grow, "guided_pairs", matched)
-    growth = Growth(own.photos(), (own.set_of(),), Config(), tmp_path, quiet, own.features, added={2})
-    for last in (False, True):
-        growth.rematched(own.model(list(range(4))), last)
-    assert asked == [(1, False)] * len(WIDENED) + [(LAST_ROUNDS, True)]
-    assert bands == [1.0, *WIDENED, 1.0, WIDENED[-1]]  # pairs without the added photo, then those with it
 
 
 def test_points_of_two_photos_alone_go() -> None:
