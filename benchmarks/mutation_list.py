@@ -137,7 +137,7 @@ MUTATIONS = (
              "tests/masks/test_masks_faces.py"),
     Mutation("stages/poses/agreement.py", "moved = uv + np.array(shift)", "moved = uv",
              "tests/poses/test_poses_grow.py"),
-    Mutation("pipeline/demo/brdf.py", "np.asarray(albedo * diffuse / len(points))", "np.asarray(diffuse / len(points))",
+    Mutation("pipeline/demo/brdf.py", "(albedo * diffuse + specular)", "(albedo * (diffuse + specular))",
              "tests/demo/test_brdf.py::test_both_parts_add_up_to_the_radiance"),
     Mutation("pipeline/silhouette_kernels.py", "front and left >= margin", "front and left >= 0",
              "tests/pipeline/test_silhouette_kernels.py"),

@@ -127,15 +127,20 @@ class Stack:
 
 def stack(views: Sequence[Silhouette]) -> Stack:
     """Of all views together."""
-    numbers = [[*v.cam_from_world[:3].ravel(), *v.K[:2].ravel(), *v.distortion, v.focal, v.width, v.height,
-                v.radius if np.any(v.distortion) else np.inf] for v in views]  # fmt: skip
     sizes = [v.distance.size for v in views]
     return Stack(
-        np.array(numbers, np.float64),
+        np.stack([_numbers(v) for v in views]),
         np.array([v.distance.shape for v in views], np.int64),
         np.concatenate([[0], np.cumsum(sizes)[:-1]]).astype(np.int64),
-        np.concatenate([v.distance.ravel() for v in views]).astype(np.float32),
+        np.concatenate([v.distance.ravel() for v in views]),
     )
+
+
+def _numbers(view: Silhouette) -> F64:
+    """(27,) a view as silhouette_kernels has it."""
+    radius = view.radius if np.any(view.distortion) else np.inf
+    lens = [*view.cam_from_world[:3].ravel(), *view.K[:2].ravel(), *view.distortion]
+    return np.array([*lens, view.focal, view.width, view.height, radius], np.float64)
 
 
 def outside(view: Silhouette, points: F64, reach: float) -> tuple[F32, Bool, Bool]:
@@ -143,9 +148,8 @@ def outside(view: Silhouette, points: F64, reach: float) -> tuple[F32, Bool, Boo
     (N,); whether it sees any of it (N,)."""
     from pipeline.silhouette_kernels import outside_one
 
-    one, n = stack([view]), len(points)
+    n, (rows, columns) = len(points), view.distance.shape
     value, whole, part = np.empty(n, np.float32), np.empty(n, bool), np.empty(n, bool)
-    rows, columns = (int(k) for k in one.shapes[0])
-    outside_one(np.asarray(points, np.float64), one.views[0], rows, columns, one.distances, float(reach), value, whole,
-                part)  # fmt: skip
+    outside_one(np.asarray(points, np.float64), _numbers(view), rows, columns, view.distance.ravel(), float(reach),
+                value, whole, part)  # fmt: skip
     return value, whole, part

@@ -186,21 +186,16 @@ def sample_directions(normal: F64, to_eye: F64, f0: F64, a: F64, shift: F64, poi
     return diffuse, specular, weight
 
 
-def shade(normal: F64, to_eye: F64, albedo: F64, f0: F64, a: F64, shift: F64, points: F64, table: F32) -> F64:
-    """Unshadowed radiance (N, 3) towards the eye, with the net `points` (S, 2) for each lobe.
+def shade(
+    normal: F64, to_eye: F64, albedo: F64, f0: F64, a: F64, shift: F64, points: F64, table: F32
+) -> tuple[F64, F64]:
+    """Unshadowed radiance (N, 3) towards the eye, with the net `points` (S, 2) for each lobe, and the mirror
+    reflection's part of it.
 
     `normal`, `to_eye`, `albedo` (N, 3); `f0`, `a` (N,); `shift` (N, 2); `table` as from `cube_table`.
     """
     diffuse, specular = sums(normal, to_eye, f0, a, shift, points, table)
-    return np.asarray((albedo * diffuse + specular) / len(points))
-
-
-def shade_apart(
-    normal: F64, to_eye: F64, albedo: F64, f0: F64, a: F64, shift: F64, points: F64, table: F32
-) -> tuple[F64, F64]:
-    """The diffuse and the specular part (N, 3) of `shade`."""
-    diffuse, specular = sums(normal, to_eye, f0, a, shift, points, table)
-    return np.asarray(albedo * diffuse / len(points)), np.asarray(specular / len(points))
+    return np.asarray((albedo * diffuse + specular) / len(points)), np.asarray(specular / len(points))
 
 
 @compiled

@@ -191,13 +191,12 @@ def srgb_from_linear(linear: F64) -> npt.NDArray[np.uint8]:
 def through_filters(picture: Picture) -> tuple[F64, F64]:
     """Cross- and parallel-polarised radiance (H, W, 3): half of the diffuse light, and with all of the mirror
     reflection, which keeps its polarisation."""
-    assert picture.specular is not None
     cross = 0.5 * POLARISED_EXPOSURE * (picture.radiance - picture.specular)
     return cross, cross + POLARISED_EXPOSURE * picture.specular
 
 
 def _write_view(folder: Path, scene: Scene, camera: Camera, i: int, polarised: bool) -> None:
-    picture = render(scene, camera, i, apart=polarised)
+    picture = render(scene, camera, i)
     photo = picture.radiance
     if polarised:
         photo, parallel = through_filters(picture)

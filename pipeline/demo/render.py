@@ -13,7 +13,7 @@ single-bounce model can explain. With `shadows` each light sample is tested agai
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -54,14 +54,14 @@ class Picture:
     """`radiance`, `albedo` (H, W, 3) linear; `normal` (H, W, 3) world, unit; `alpha` (H, W) in [0, 1].
 
     Radiance is already covered by alpha; albedo and normal are means over the covered part of a pixel.
-    `specular`: the mirror reflection's part of the radiance, if it was asked for.
+    `specular`: the mirror reflection's part of the radiance.
     """
 
     radiance: F64
     albedo: F64
     normal: F64
     alpha: F64
-    specular: F64 | None = None
+    specular: F64
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,9 +95,8 @@ def scene_from_mesh(mesh: Mesh, coefficients: F64, samples: int, seed: int, shad
     return Scene(embree, table, net, seed, shadows)
 
 
-def render(scene: Scene, camera: Camera, stream: int, apart: bool = False) -> Picture:
-    """Render one picture; `stream` selects its random numbers, for example the view's number. `apart`: the mirror
-    reflection alone as well, with the same samples."""
+def render(scene: Scene, camera: Camera, stream: int) -> Picture:
+    """Render one picture; `stream` selects its random numbers, for example the view's number."""
     pixels = camera.size * camera.size
     shift = np.random.default_rng((scene.seed, stream)).random((pixels, 2))
     radiance, albedo, normal, specular = (np.zeros((pixels, 3)) for _ in range(4))
@@ -107,10 +106,9 @@ def render(scene: Scene, camera: Camera, stream: int, apart: bool = False) -> Pi
         hits = _trace(scene, camera, offset)
         look = skin.material(hits.points, scene.seed)
         net = scene.net[corner * quarter : (corner + 1) * quarter]
-        radiance[hits.pixel] += _shade(scene, hits, look, shift[hits.pixel], net)
-        if apart:
-            mirror = replace(look, albedo=np.zeros_like(look.albedo))
-            specular[hits.pixel] += _shade(scene, hits, mirror, shift[hits.pixel], net)
+        shaded, mirror = _shade(scene, hits, look, shift[hits.pixel], net)
+        radiance[hits.pixel] += shaded
+        specular[hits.pixel] += mirror
         albedo[hits.pixel] += look.albedo
         normal[hits.pixel] += hits.normals
         count[hits.pixel] += 1.0
@@ -122,7 +120,7 @@ def render(scene: Scene, camera: Camera, stream: int, apart: bool = False) -> Pi
         (albedo / covered).reshape(*shape, 3),
         (normal / length).reshape(*shape, 3),
         (count / len(_CORNERS)).reshape(shape),
-        (specular / len(_CORNERS)).reshape(*shape, 3) if apart else None,
+        (specular / len(_CORNERS)).reshape(*shape, 3),
     )
 
 
@@ -170,17 +168,19 @@ def _pixels_near(camera: Camera) -> npt.NDArray[np.int64]:
     return np.asarray((rows[:, None] * camera.size + columns).reshape(-1), dtype=np.int64)
 
 
-def _shade(scene: Scene, hits: Hits, look: skin.Material, shift: F64, net: F64) -> F64:
+def _shade(scene: Scene, hits: Hits, look: skin.Material, shift: F64, net: F64) -> tuple[F64, F64]:
+    """Radiance (N, 3), and the mirror reflection's part of it."""
     width = look.roughness**2
     if not scene.shadows:
         return brdf.shade(hits.normals, hits.to_eye, look.albedo, look.f0, width, shift, net, scene.table)
-    total = np.zeros_like(hits.points)
+    total, mirror = np.zeros_like(hits.points), np.zeros_like(hits.points)
     for point in net:
         diffuse, specular, weight = brdf.sample_directions(hits.normals, hits.to_eye, look.f0, width, shift, point)
         lit = _visible(scene, hits, diffuse)[:, None] * brdf.look_up_many(scene.table, diffuse)
         shine = _visible(scene, hits, specular)[:, None] * brdf.look_up_many(scene.table, specular)
         total += look.albedo * lit + weight[:, None] * shine
-    return total / len(net)
+        mirror += weight[:, None] * shine
+    return total / len(net), mirror / len(net)
 
 
 def _visible(scene: Scene, hits: Hits, direction: F64) -> Bool:

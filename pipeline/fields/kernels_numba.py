@@ -242,8 +242,8 @@ def hash_forward(table, offset, size, hashed, mask, lo, inv, x, out):
 def hash_backward(table, offset, size, hashed, mask, lo, inv, x, grad_out, grad_table, grad_x):
     """Gradients of the table (added) and of x, (L, N, 3) to be summed over levels. Levels own disjoint table rows."""
     levels = offset.shape[0]
+    half = (levels + 1) // 2
     for p in prange(levels):
-        half = (levels + 1) // 2
         level = 2 * p if p < half else 2 * (p - half) + 1  # coarse levels are faster, and each thread gets some
         for n in range(x.shape[0]):
             ux, uy, uz = (

@@ -39,7 +39,7 @@ def shaded(albedo: float, f0: float, width: float, cosine: float, table: F32, sa
     turns = np.random.default_rng(1).random((8, 2))
     rows = len(turns)
     net = qmc.Sobol(2, scramble=False).random(samples)
-    out = brdf.shade(
+    out, _ = brdf.shade(
         np.tile(NORMAL, (rows, 1)), np.tile(eye(cosine), (rows, 1)), np.full((rows, 3), albedo),
         np.full(rows, f0), np.full(rows, width), turns, net, table,
     )  # fmt: skip
@@ -191,7 +191,7 @@ def test_single_samples_add_up_to_the_fused_loop(table: F32) -> None:
         diffuse, specular, weight = brdf.sample_directions(normal, to_eye, f0, width, shift, point)
         total += albedo * brdf.look_up_many(table, diffuse)
         total += weight[:, None] * brdf.look_up_many(table, specular)
-    fused = brdf.shade(normal, to_eye, albedo, f0, width, shift, net, table)
+    fused, _ = brdf.shade(normal, to_eye, albedo, f0, width, shift, net, table)
     np.testing.assert_allclose(total / 16, fused, rtol=1e-6)
 
 
@@ -200,17 +200,18 @@ def test_both_parts_add_up_to_the_radiance(table: F32) -> None:
     normal = np.tile([0.0, 0.0, 1.0], (20, 1))
     to_eye = normal + 0.5 * rng.normal(size=(20, 3))
     to_eye /= np.linalg.norm(to_eye, axis=1, keepdims=True)
-    albedo, f0, width, shift = rng.random((20, 3)), np.full(20, 0.04), np.full(20, 0.2), rng.random((20, 2))
-    rest = normal, to_eye, f0, width, shift
+    albedo, width, shift = rng.random((20, 3)), np.full(20, 0.2), rng.random((20, 2))
     net = qmc.Sobol(2, scramble=False).random(16)
 
-    def of(albedo: F64, f0: F64) -> tuple[F64, F64, F64]:
-        given = rest[0], rest[1], albedo, f0, *rest[3:], net, table
-        return brdf.shade(*given), *brdf.shade_apart(*given)
+    def of(albedo: F64, f0: float) -> tuple[F64, F64]:
+        return brdf.shade(normal, to_eye, albedo, np.full(20, f0), width, shift, net, table)
 
-    whole, diffuse, specular = of(albedo, f0)
-    np.testing.assert_allclose(diffuse + specular, whole, rtol=1e-12)
-    np.testing.assert_allclose(of(np.zeros_like(albedo), f0)[0], specular, rtol=1e-12)
-    black, white = of(albedo, np.zeros_like(f0)), of(albedo, np.ones_like(f0))
-    np.testing.assert_allclose(black[1], diffuse, rtol=1e-12)  # the lobes are not coupled
-    assert (white[2] > specular).all() and (specular > black[2]).all()
+    whole, specular = of(albedo, 0.04)
+    diffuse = whole - specular
+    black, alone = of(np.zeros_like(albedo), 0.04)
+    np.testing.assert_allclose(black, specular, rtol=1e-12)
+    np.testing.assert_array_equal(alone, specular)
+    np.testing.assert_allclose(of(2 * albedo, 0.04)[0] - whole, diffuse, rtol=1e-9)
+    rim, mirror = of(albedo, 0.0), of(albedo, 1.0)
+    np.testing.assert_allclose(rim[0] - rim[1], diffuse, rtol=1e-9)  # the lobes are not coupled
+    assert (mirror[1] > specular).all() and (specular > rim[1]).all()

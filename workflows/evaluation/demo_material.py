@@ -174,13 +174,13 @@ def true_looks(folder: Path, points: F64, normals: F64, to_eye: F64) -> Looks:
 
     def shaded(i: int) -> tuple[F64, F64]:
         some = slice(i, i + SHADED)
-        return brdf.shade_apart(
+        return brdf.shade(
             normals[some], to_eye[some], look.albedo[some], look.f0[some], width[some], shift[some], net, table
         )
 
     parts = list(side_by_side(shaded, range(0, max(len(points), 1), SHADED)))
-    diffuse, specular = (np.concatenate(part) for part in zip(*parts, strict=True))
-    return Looks(look.albedo, look.f0, look.roughness, diffuse, specular)
+    both, specular = (np.concatenate(part) for part in zip(*parts, strict=True))
+    return Looks(look.albedo, look.f0, look.roughness, both - specular, specular)
 
 
 def fitted_looks(model: Any, points: F64, to_eye: F64, capture_from_asset: F64) -> Looks:
