@@ -10,6 +10,8 @@ from benchmarks.mutation_list_of_asset import OF_ASSET
 from benchmarks.mutation_list_of_cameras import OF_CAMERAS
 from benchmarks.mutation_list_of_fit import OF_FIT
 
+FAIR = "tests/surface/test_surface_fairing.py"
+
 MUTATIONS = (
     # ---------------------------------------------------------------- equations
     Mutation("pipeline/maths/vmf.py", "-0.5 * l * (l + 1) * inv_kappa", "-0.5 * l * l * inv_kappa",
@@ -213,6 +215,25 @@ MUTATIONS = (
              'if not np.isfinite(value):\n            return "good"', "tests/pipeline/test_verdict.py"),
     Mutation("pipeline/verdict.py", "return max(levels, key=LEVELS.index", "return min(levels, key=LEVELS.index",
              "tests/pipeline/test_verdict.py"),
+    # ---------------------------------------------------------------- unseen surface
+    Mutation("stages/surface/fairing.py", "(length**2 * square) ** 2", "length**2 * square",
+             f"{FAIR}::test_each_wave_is_damped_by_the_formula"),
+    Mutation("stages/surface/fairing.py", "np.where(opened, np.maximum(phi, first - cell), phi)", "phi",
+             f"{FAIR}::test_a_deep_hollow_that_a_camera_looks_into_stays_empty"),
+    Mutation("stages/surface/fairing.py", "NEAR * cell, NEAR * cell + length", "-1, 0",
+             f"{FAIR}::test_a_knob_behind_goes_and_what_the_camera_sees_stays"),
+    Mutation("pipeline/fields/faired.py", " + more[:, None] * of_share", "",
+             f"{FAIR}::test_the_gradient_is_that_of_the_values"),
+    Mutation("stages/surface/fairing.py", "np.where(inside, -inner, outer)", "np.where(inside, inner, outer)",
+             f"{FAIR}::test_a_ball_that_is_seen_from_one_side_stays_a_ball"),
+    Mutation("stages/surface/stage.py", "and config.fair > 0", "and config.fair > 1",
+             f"{FAIR}::test_the_stage_fairs_unless_the_setting_is_zero"),
+    Mutation("stages/bake/stage.py", "context.device), fairing)", "context.device), None)",
+             "tests/bake/test_bake_stage.py::test_the_maps_are_of_the_fair_surface_where_there_is_one"),
+    Mutation("pipeline/fields/faired.py", "ndimage.maximum_filter(self._share, 5)", "(self._share)",
+             f"{FAIR}::test_the_file_has_the_same_distances_at_the_surface"),
+    Mutation("pipeline/visibility.py", "= ~occluder.blocks(points[live], toward[live])", "= True",
+             f"{FAIR}::test_looks_into_asks_frame_and_mesh"),
     # ---------------------------------------------------------------- store and workflows
     Mutation("pipeline/store.py", "None if sha256_of(path) == ref.sha256 else", "None if True else",
              "tests/core/test_contract.py::test_a_damaged_artifact_is_found_and_made_anew"),

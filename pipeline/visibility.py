@@ -133,6 +133,27 @@ def view_cosines(view: FittedPhoto, points: F64, normals: F64, occluder: Occlude
     return out, uv
 
 
+def looks_into(view: FittedPhoto, points: F64, occluder: Occluder) -> tuple[Mask, Mask]:
+    """(N,) which points (N, 3) lie in the photo's frame with nothing of the mesh before them, and (N,) where the photo
+    shows the subject there, in pixels that count."""
+    from pipeline.visibility_kernels import facing
+
+    camera = view.camera
+    toward = matrix(camera.world_from_cam)[:3, 3] - points
+    toward /= np.linalg.norm(toward, axis=1, keepdims=True)
+    cosine, uv = np.empty(len(points)), np.full((len(points), 2), np.nan)
+    facing(_row(camera), np.ascontiguousarray(points), toward, cosine, uv)
+    into, shown = (np.zeros(len(points), np.bool_) for _ in range(2))
+    live = np.flatnonzero(cosine)
+    into[live] = ~occluder.blocks(points[live], toward[live])
+    live = np.flatnonzero(into)
+    shown[live] = True
+    for path in (view.mask, view.asked):
+        if path is not None:
+            shown[live] &= picked(mask_of(path), camera, uv[live])
+    return into, shown
+
+
 def _row(camera: Camera) -> F64:
     """A camera's numbers in the order of visibility_kernels."""
     pose, lens = matrix(camera.world_from_cam), np.array(camera.distortion, np.float64)

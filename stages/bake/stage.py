@@ -92,6 +92,7 @@ def _within(maps: Mapping[str, TextureMap], folder: str) -> dict[str, TextureMap
 def _baked(inputs: Inputs, config: Config, context: Context) -> TextureSet:
     from pipeline import footprint, meshes
     from pipeline.fields.face import load_face
+    from pipeline.fields.faired import fair_again
     from pipeline.lighting.surroundings import surroundings_of
     from pipeline.people import shows_person
     from pipeline.visibility import seen_by
@@ -110,7 +111,9 @@ def _baked(inputs: Inputs, config: Config, context: Context) -> TextureSet:
     from stages.bake.write import joined, write_maps
 
     uv, fitted = inputs.uv, inputs.inverse_rendering
-    field = load_face(fitted.path(fitted.artifact.field), context.device)
+    surface = inputs.surface
+    fairing = None if surface.artifact.fairing is None else surface.path(surface.artifact.fairing)
+    field = fair_again(load_face(fitted.path(fitted.artifact.field), context.device), fairing)
     path = uv.path(uv.artifact.mesh)
     views = seen_by(fitted.artifact, inputs.poses.artifact, inputs.masks, inputs.capture)
     exposure = {v.index: v.exposure for v in inputs.capture.artifact.views}
@@ -207,4 +210,4 @@ def responses(field: FittedField, exposures: Sequence[float]) -> F64:
     return np.asarray(e * (np.eye(3) if fitted is None else fitted), np.float64)
 
 
-STAGE = Stage(name="bake", version=46, inputs=Inputs, config=Config, output=TextureSet, run=run)
+STAGE = Stage(name="bake", version=47, inputs=Inputs, config=Config, output=TextureSet, run=run)

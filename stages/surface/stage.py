@@ -13,7 +13,7 @@ from pipeline.capture_artifacts import Capture
 from pipeline.contract import Context, Stage, StageConfig
 from pipeline.units import Cells, Unit
 
-MESH = "surface.npz"
+MESH, FAIRING = "surface.npz", "fairing.npz"
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,6 +38,13 @@ class Config(StageConfig):
     unseen: Literal["closed", "trimmed"] = Field(
         "closed", description="surface that no fitted photo shows: keep it (closed mesh) or cut it off"
     )
+    fair: Annotated[float, Unit("share of the box's longest side")] = Field(
+        0.022,
+        ge=0,
+        le=0.05,
+        description="length over which surface is smoothed that no camera looks at, as a share of the box's longest "
+        "side; 0 keeps it as the fit left it",
+    )
     handle: Annotated[float, Unit("share of the box's longest side")] = Field(
         0.1,
         ge=0,
@@ -50,8 +57,10 @@ def run(inputs: Inputs, config: Config, context: Context) -> Surface:
     """Mesh the zero set. Raises StageError if the field has none."""
     from pipeline import meshes
     from pipeline.fields.face import load_face
-    from pipeline.visibility import Occluder, seen_by, view_cosines
+    from pipeline.fields.faired import Faired
+    from pipeline.visibility import Occluder, looks_into, seen_by, view_cosines
     from stages.surface.build import build
+    from stages.surface.fairing import faired
     from stages.surface.judge import judge
     from stages.surface.judge_face import face_findings
     from stages.surface.pieces import votes
@@ -64,6 +73,19 @@ def run(inputs: Inputs, config: Config, context: Context) -> Surface:
         context.progress(done, total, "marching cubes")
 
     views = seen_by(fitted.artifact, inputs.poses.artifact, inputs.masks, inputs.capture)
+    trims, extent = config.unseen == "trimmed", inputs.masks.artifact.extent
+
+    def looked(rough: meshes.Mesh, points: meshes.F64) -> tuple[meshes.Mask, meshes.Mask]:
+        occluder, (into, shown) = Occluder(rough), np.zeros((2, len(points)), np.bool_)
+        for view in views:
+            context.check()
+            rest = np.flatnonzero(~shown)
+            more, shown[rest] = looks_into(view, points[rest], occluder)
+            into[rest] |= more
+        return into, shown
+
+    fairs = bool(views) and config.fair > 0 and not trims
+    solid = faired(field, config.fair, looked, step, extent) if fairs else field
 
     def vote(mesh: meshes.Mesh, piece: meshes.Indices) -> meshes.F64:
         return votes(mesh, piece, views, context.check)
@@ -78,9 +100,10 @@ def run(inputs: Inputs, config: Config, context: Context) -> Surface:
             seen[rest] = view_cosines(view, points[rest], normals[rest], occluder)[0] > 0
         return seen
 
-    trims, extent = config.unseen == "trimmed", inputs.masks.artifact.extent
-    built = build(field, config.resolution, step, sees if trims else None, config.handle, vote, extent)
+    built = build(solid, config.resolution, step, sees if trims else None, config.handle, vote, extent)
     meshes.save(context.workdir / MESH, built.mesh)
+    if isinstance(solid, Faired):
+        solid.save(context.workdir / FAIRING)
     context.log.info(
         "surface: %d faces, cell %.4g, %.1f %% cap, largest residual %.2g, %d handles cut",
         len(built.mesh.faces),
@@ -91,6 +114,7 @@ def run(inputs: Inputs, config: Config, context: Context) -> Surface:
     )
     return Surface(
         mesh=context.file(MESH),
+        fairing=context.file(FAIRING) if isinstance(solid, Faired) else None,
         vertices=len(built.mesh.vertices),
         faces=len(built.mesh.faces),
         watertight=built.topology.manifold,
@@ -105,4 +129,4 @@ def run(inputs: Inputs, config: Config, context: Context) -> Surface:
     )
 
 
-STAGE = Stage(name="surface", version=6, inputs=Inputs, config=Config, output=Surface, run=run)
+STAGE = Stage(name="surface", version=10, inputs=Inputs, config=Config, output=Surface, run=run)

@@ -16,6 +16,7 @@ from pipeline.capture_artifacts import Capture, CaptureView
 from pipeline.colour import srgb_from_linear
 from pipeline.contract import Context
 from pipeline.errors import Cancelled
+from pipeline.fields.faired import Faired
 from pipeline.images import read_encoded, read_exr, write_png
 from pipeline.meshes import Charts, Mesh
 from pipeline.visibility import seen_by
@@ -92,6 +93,20 @@ def photographed(folder: Path) -> Located[Capture]:
     )
     (folder / "3.png").unlink()
     return Located(Capture(kind="facescape", views=views), folder)
+
+
+def test_the_maps_are_of_the_fair_surface_where_there_is_one(inputs: Inputs, tmp_path: Path) -> None:
+    """Distances that put the zero set 4 mm further out, behind the mesh that is 0.2 mm beside the field's own."""
+    lower, n, cell = np.full(3, -0.13), 27, 0.01
+    at = lower + cell * np.stack(np.meshgrid(*[np.arange(n)] * 3, indexing="ij"), -1)
+    phi = (np.linalg.norm(at, axis=-1) - 0.084).astype(np.float32)
+    field = AnalyticField(sphere(0.08))
+    Faired(field, lower, cell, phi, (at[..., 2] < 0).astype(np.float32)).save(tmp_path / "fairing.npz")
+    fair = inputs.surface.artifact.model_copy(update={"fairing": FileRef.of(tmp_path, "fairing.npz")})
+    textures = run(
+        dataclasses.replace(inputs, surface=Located(fair, tmp_path)), Config(size=256), Context(tmp_path, tmp_path)
+    )
+    assert textures.lod_rms_mm["render"] == pytest.approx(4 * 0.5**0.5, abs=0.3)
 
 
 def test_run_writes_every_map(inputs: Inputs, tmp_path: Path) -> None:
