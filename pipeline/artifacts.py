@@ -293,8 +293,8 @@ class FittedFace(Artifact):
 class Surface(Artifact):
     """Zero set of the SDF as triangles. npz: vertices (V, 3) float32, normals (V, 3) float32, faces (F, 3) int32.
     trimmed: share of its area that no photo shows and that was cut off. handles_cut: number of handles that were
-    removed; handles_left: number of those that are too wide to be noise. fairing: the distances of what no camera looks
-    at (pipeline.fields.faired); None: all are the field's own."""
+    removed; handles_left: number of those that are too wide to be noise. fairing: the distances of what no photo shows
+    (pipeline.fields.faired); None: all are the field's own."""
 
     mesh: FileRef
     fairing: FileRef | None = None

@@ -1,4 +1,4 @@
-"""A field whose surface was made fair where no camera looks (stages.surface.fairing), as a file beside the mesh.
+"""A field whose surface was made fair where no photo shows it (stages.surface.fairing), as a file beside the mesh.
 
 d' = (1 - b) d + b phi      d the field's own distance; phi, b trilinear on a coarse grid
 """

@@ -42,7 +42,7 @@ class Config(StageConfig):
         0.022,
         ge=0,
         le=0.05,
-        description="length over which surface is smoothed that no camera looks at, as a share of the box's longest "
+        description="length over which surface is smoothed that no photo shows, as a share of the box's longest "
         "side; 0 keeps it as the fit left it",
     )
     handle: Annotated[float, Unit("share of the box's longest side")] = Field(

@@ -1,4 +1,4 @@
-"""Surface that no camera looks at: smooth, closed, and nothing else changed."""
+"""Surface that no photo shows: smooth, closed, and nothing else changed."""
 
 from __future__ import annotations
 
