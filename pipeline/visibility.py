@@ -120,10 +120,7 @@ def view_cosines(view: FittedPhoto, points: F64, normals: F64, occluder: Occlude
     cosine, uv = np.empty(len(points)), np.full((len(points), 2), np.nan)
     facing(_row(camera), np.ascontiguousarray(points), np.ascontiguousarray(normals), cosine, uv)
     live = np.flatnonzero(cosine)
-    if view.mask is not None:
-        live = live[picked(mask_of(view.mask), camera, uv[live])]
-    if view.asked is not None:  # elsewhere the subject is not fitted, so that its colours there mean nothing
-        live = live[picked(mask_of(view.asked), camera, uv[live])]
+    live = live[_counts(view, uv[live])]
     out = np.zeros(len(points))
     if len(live):
         away = matrix(camera.world_from_cam)[:3, 3] - points[live]
@@ -147,11 +144,18 @@ def looks_into(view: FittedPhoto, points: F64, occluder: Occluder) -> tuple[Mask
     live = np.flatnonzero(cosine)
     into[live] = ~occluder.blocks(points[live], toward[live])
     live = np.flatnonzero(into)
-    shown[live] = True
+    shown[live] = _counts(view, uv[live])
+    return into, shown
+
+
+def _counts(view: FittedPhoto, uv: F64) -> Mask:
+    """(N,) whether a photo shows the subject at positions uv (N, 2), in pixels that count: elsewhere the subject is not
+    fitted, so that its colours there mean nothing."""
+    out = np.ones(len(uv), np.bool_)
     for path in (view.mask, view.asked):
         if path is not None:
-            shown[live] &= picked(mask_of(path), camera, uv[live])
-    return into, shown
+            out &= picked(mask_of(path), view.camera, uv)
+    return out
 
 
 def _row(camera: Camera) -> F64:

@@ -31,6 +31,7 @@ from pipeline.fields.faired import Faired
 from pipeline.fields.protocol import Field
 from pipeline.maths.smoothstep import smoothstep
 from pipeline.meshes import F64, Mask, Mesh
+from pipeline.visibility import Occluder
 from stages.surface.extract import Lattice, Step, extract, lattice
 
 CELLS = 128  # along the box's longest side
@@ -40,7 +41,7 @@ NEAR = 2.0  # cells: the surface lies up to BESIDE from a shown node, and is to 
 ROUNDS = 4
 SPECK, AROUND = 0.25, 2.0  # share of the nodes beside the surface that are shown, and cells (deviation) around one
 
-Looked = Callable[[Mesh, F64], tuple[Mask, Mask]]
+Looked = Callable[[Occluder, F64], tuple[Mask, Mask]]
 
 
 def low_pass(values: F64, length: float) -> F64:
@@ -62,15 +63,16 @@ def faired(field: Field, share: float, looked: Looked, step: Step, extent: Exten
     """
     grid = lattice(field, CELLS, extent)
     vertices, faces = extract(field, grid, step)
-    rough = Mesh(vertices.astype(np.float32), np.zeros((len(vertices), 3), np.float32), faces)
+    rough = Occluder(Mesh(vertices.astype(np.float32), np.zeros((len(vertices), 3), np.float32), faces))
     lower, cell, length, nodes = grid.lower, grid.h, share * CELLS * grid.h, _nodes(grid)
     inner = np.clip(nodes, lower, grid.upper).reshape(-1, 3).astype(np.float32)
     first = _distances(field.sdf(inner).reshape(nodes.shape[:3]).astype(np.float64), cell)
     beside = (first > 0) & (first < BESIDE * cell)
 
     def marked(where: Mask) -> tuple[Mask, Mask]:
-        into, there = looked(rough, nodes[where])
-        return _marked(where, into), _marked(where, there)
+        found = np.zeros((2, *where.shape), np.bool_)
+        found[:, where] = looked(rough, nodes[where])
+        return found[0], found[1]
 
     opened, shown = marked(beside)
     shown &= _share_around(shown, beside) >= SPECK
@@ -107,10 +109,3 @@ def _share_around(shown: Mask, of: Mask) -> F64:
     """(X, Y, Z) share of the nodes `of` around each node that are `shown`, weighted by a Gaussian."""
     near, every = (ndimage.gaussian_filter(x.astype(np.float64), AROUND, mode="constant") for x in (shown, of))
     return np.asarray(near / np.maximum(every, 1e-9), np.float64)
-
-
-def _marked(where: Mask, values: Mask) -> Mask:
-    """(X, Y, Z) the values (N,) of the N nodes `where`; False elsewhere."""
-    out = np.zeros(where.shape, np.bool_)
-    out[where] = values
-    return out

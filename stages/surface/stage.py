@@ -75,12 +75,12 @@ def run(inputs: Inputs, config: Config, context: Context) -> Surface:
     views = seen_by(fitted.artifact, inputs.poses.artifact, inputs.masks, inputs.capture)
     trims, extent = config.unseen == "trimmed", inputs.masks.artifact.extent
 
-    def looked(rough: meshes.Mesh, points: meshes.F64) -> tuple[meshes.Mask, meshes.Mask]:
-        occluder, (into, shown) = Occluder(rough), np.zeros((2, len(points)), np.bool_)
+    def looked(rough: Occluder, points: meshes.F64) -> tuple[meshes.Mask, meshes.Mask]:
+        into, shown = np.zeros((2, len(points)), np.bool_)
         for view in views:
             context.check()
             rest = np.flatnonzero(~shown)
-            more, shown[rest] = looks_into(view, points[rest], occluder)
+            more, shown[rest] = looks_into(view, points[rest], rough)
             into[rest] |= more
         return into, shown
 

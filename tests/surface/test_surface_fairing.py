@@ -16,7 +16,7 @@ from pipeline.errors import StageError
 from pipeline.fields.faired import Faired, fair_again
 from pipeline.fields.protocol import Field
 from pipeline.images import write_png
-from pipeline.meshes import F64, Mask, Mesh
+from pipeline.meshes import F64, Mask
 from pipeline.visibility import FittedPhoto, Occluder, looks_into
 from stages.surface import build as building
 from stages.surface import fairing
@@ -39,17 +39,17 @@ def quiet(done: int, total: int) -> None:
     """No progress shown."""
 
 
-def from_the_front(rough: Mesh, points: F64) -> tuple[Mask, Mask]:
+def from_the_front(rough: Occluder, points: F64) -> tuple[Mask, Mask]:
     """One camera on +z, far away: what is before the surface along z."""
     there = FittedPhoto(camera(0, 0.0, 1.0, focal=100.0), None)
-    return looks_into(there, points, Occluder(rough))
+    return looks_into(there, points, rough)
 
 
-def nowhere(rough: Mesh, points: F64) -> tuple[Mask, Mask]:
+def nowhere(rough: Occluder, points: F64) -> tuple[Mask, Mask]:
     return np.zeros(len(points), np.bool_), np.zeros(len(points), np.bool_)
 
 
-def everywhere(rough: Mesh, points: F64) -> tuple[Mask, Mask]:
+def everywhere(rough: Occluder, points: F64) -> tuple[Mask, Mask]:
     return np.ones(len(points), np.bool_), np.ones(len(points), np.bool_)
 
 
@@ -124,7 +124,7 @@ def test_a_tunnel_behind_closes_and_one_that_the_camera_looks_through_stays() ->
 def test_a_deep_hollow_that_a_camera_looks_into_stays_empty() -> None:
     """A hole whose walls count as seen by nobody: only the space in it is."""
 
-    def into_the_hole(rough: Mesh, points: F64) -> tuple[Mask, Mask]:
+    def into_the_hole(rough: Occluder, points: F64) -> tuple[Mask, Mask]:
         shown = points[:, 2] > 0.05
         return shown | (np.hypot(points[:, 0], points[:, 1]) < 0.003), shown
 
@@ -230,7 +230,7 @@ def test_shown_asks_the_mask_and_the_pixels_that_count(tmp_path: Path) -> None:
 def test_a_speck_of_unseen_surface_that_is_shown_holds_nothing() -> None:
     """A knob behind, of which a photo shows one place, goes; the front, where one place is hidden, stays."""
 
-    def looked(rough: Mesh, points: F64) -> tuple[Mask, Mask]:
+    def looked(rough: Occluder, points: F64) -> tuple[Mask, Mask]:
         into, shown = from_the_front(rough, points)
         speck = np.linalg.norm(points - [0, 0, -0.102], axis=1) < 0.004
         hidden = np.linalg.norm(points - [0, 0, 0.082], axis=1) < 0.004
@@ -244,7 +244,7 @@ def test_a_speck_of_unseen_surface_that_is_shown_holds_nothing() -> None:
 def test_a_knob_that_a_camera_sees_before_a_wall_goes_too() -> None:
     """At the side of the head, seen by the camera, but not shown by its photo."""
 
-    def looked(rough: Mesh, points: F64) -> tuple[Mask, Mask]:
+    def looked(rough: Occluder, points: F64) -> tuple[Mask, Mask]:
         into, _ = from_the_front(rough, points)
         return into, into & (points[:, 0] < 0.07)
 
@@ -267,10 +267,10 @@ def test_the_stage_fairs_unless_the_setting_is_zero(tmp_path: Path, monkeypatch:
 
 
 def test_a_head_that_cameras_see_from_all_sides_hardly_changes() -> None:
-    def around(rough: Mesh, points: F64) -> tuple[Mask, Mask]:
+    def around(rough: Occluder, points: F64) -> tuple[Mask, Mask]:
         angles = np.linspace(0, 2 * np.pi, 9)[:-1]
         views = [FittedPhoto(camera(i, a, 1.0, focal=100.0), None) for i, a in enumerate(angles)]
-        into, shown = np.any([looks_into(v, points, Occluder(rough)) for v in views], 0)
+        into, shown = np.any([looks_into(v, points, rough) for v in views], 0)
         return into, shown
 
     field = AnalyticField(bumpy_head())
