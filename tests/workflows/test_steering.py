@@ -130,18 +130,21 @@ def test_the_check_counts_the_time_within_it() -> None:
 
 # ------------------------------------------------------------------ a run
 def test_a_paused_run_has_the_same_bytes_and_no_time_for_it(photos: Path, toys: None) -> None:
-    """Also: a limit of half a second for each stage does not end it."""
-    plan = plan_of(photos, stage_limit=0.5)
-    watch = Session(Recorded())
+    """Also: a limit of half the pause for each stage does not end it."""
+    pause, done = 2.4, list[Any]()
+    plan = plan_of(photos, stage_limit=pause / 2)
+    watch, begun = Session(Recorded()), time.monotonic()
     watch.steering.wish("pause")
-    done: list[Any] = []
     thread, errors = in_thread(lambda: done.extend(run_stages(plan, watch)))
     wait_for(lambda: watch.steering.paused)
-    time.sleep(1.2)
+    time.sleep(pause)
     watch.steering.wish("go on")
     thread.join(20)
+    in_all = time.monotonic() - begun
     assert errors == [] and [d.stage for d in done] == ["first", "second", "third"]
-    assert done[0].run["seconds"] < 0.8 and watch.elapsed() < time.monotonic() - watch.begun - 1
+    # What is left of the time, not a number of seconds: a busy machine takes as long as it likes beside the pause.
+    assert sum(d.run["seconds"] for d in done) <= in_all - pause
+    assert watch.elapsed() <= time.monotonic() - watch.begun - pause
     assert watch.observer.told == ["first", True, False, "second", "third"]  # type: ignore[attr-defined]
     other = make_plan(plan.request.model_copy(update={"out": str(photos.parent / "other"), "stage_limit": None}))
     assert [d.located.artifact for d in run_stages(other)] == [d.located.artifact for d in done]
