@@ -4,7 +4,8 @@ A photo that sees the surface at a grazing angle mixes it with what lies behind,
 colours, and continuing them gives smears; and a mean over the whole head makes the back of a dark-haired head bald.
 Hence only well seen vertices are kept, and others are drawn, over the length L, to the median of the seen albedo of
 their region of the head template (scalp, ears, face, bands of the neck; the rest): smoothing.continued. The neck is
-divided by height, because a collar or long hair ends at about one height all around it. Of hair and scalp the vertices
+divided by height, because a collar or long hair ends at about one height all around it, and its front from the rest,
+because the nape goes on as the sides do: long hair covers them, and a throat is bare. Of hair and scalp the vertices
 count that photos show farthest inside of the silhouette, and that are farthest from what they show of other regions: at
 the outline the wall shines through loose hair, and a fringe shows the forehead. So it does where hair is seen at a
 slant, and hair is kept from a larger cosine on than a solid.
@@ -18,14 +19,16 @@ import numpy as np
 
 from pipeline.maths.smoothstep import smoothstep
 from pipeline.meshes import F64, Indices, Mask
-from pipeline.registration.head_regions import FIRST_BAND, HAIR, REGIONS
+from pipeline.registration.head_regions import BANDS, FIRST_BAND, FIRST_BEHIND, HAIR, REGIONS, REST
 from pipeline.visibility import FEW
+from stages.bake.nearby import nearby_colours
 
 GRAZING, CLEAR = FEW  # cosines: up to the first the albedo is replaced, from the second on it is kept
 HAIR_GRAZING, HAIR_CLEAR = 0.3, 0.5  # the same for hair
 LENGTH = 0.015  # metres over which a region's colour replaces that of the seen rim
 BEST = 1 / 3  # of the well seen vertices
 MIN_SHARE = 0.02  # of a region's vertices that must be seen for its own median; else that of the whole head
+AROUND = 4  # bands up or down that are as unlike as the front of the neck and what is behind it
 LOOSE = (REGIONS.index("scalp"), HAIR)  # whose outline is not that of a solid
 
 
@@ -46,7 +49,7 @@ def region_colours(points: F64, albedo: F64, region: Indices, cosine: F64, depth
     """(V, 3) for each vertex, at points (V, 3), the median albedo (V, 3) of the best seen vertices of its region (V,):
     the upper BEST of all that are seen well by the cosine (V,), or of LOOSE regions by how far inside they are: by the
     depth (V,) inside of the silhouettes and the distance to other regions. A band that is not seen takes the nearest
-    band's colour, other regions that of the whole head."""
+    band's colour, the rest that of what is seen nearby, other regions that of the whole head."""
     seen, known = cosine >= CLEAR, {}
     for code in np.unique(region):
         mine = region == code
@@ -56,11 +59,31 @@ def region_colours(points: F64, albedo: F64, region: Indices, cosine: F64, depth
     whole, bands = _median(albedo, cosine, seen), [c for c in known if c >= FIRST_BAND]
     out = np.broadcast_to(whole, albedo.shape).copy()
     for code in map(int, np.unique(region)):
+        own = region == code
         if code >= FIRST_BAND and code not in known and bands:
-            out[region == code] = known[min(bands, key=lambda b: abs(b - code))]
+            out[own] = known[min(bands, key=lambda b: _unlike(b, code))]
         elif code in known:
-            out[region == code] = known[code]
+            out[own] = known[code]
+    off_head = (region == REST) | (region == HAIR) | (region >= FIRST_BEHIND)
+    if (off_head & seen).any():
+        asked = np.flatnonzero((region == REST) & ~seen)
+        asked = asked[_nearer(points[asked], points[seen & off_head], points[seen & ~off_head])]
+        out[asked] = nearby_colours(points[asked], points[seen & off_head], albedo[seen & off_head])
     return out
+
+
+def _nearer(at: F64, to: F64, than: F64) -> Mask:
+    """(N,) whether at (N, 3) the points to (M, 3) are nearer than the points than (L, 3); the head's inside is nearer
+    to its face than to hair and clothes."""
+    from scipy.spatial import cKDTree
+
+    return np.asarray(cKDTree(to).query(at)[0] < cKDTree(than).query(at)[0] if len(than) else np.ones(len(at), bool))
+
+
+def _unlike(band: int, other: int) -> int:
+    """How far apart two bands of the neck are, in bands."""
+    (side, height), (its_side, its_height) = (divmod(b - FIRST_BAND, BANDS) for b in (band, other))
+    return abs(height - its_height) + AROUND * abs(side - its_side)
 
 
 def _inside(points: F64, depth: F64, own: Mask, others: Mask) -> F64:

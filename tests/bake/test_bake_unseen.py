@@ -12,12 +12,15 @@ from pipeline.images import write_png
 from pipeline.meshes import Mesh
 from pipeline.registration.head_regions import (
     BAND_HEIGHT,
+    BANDS,
     CLEAR_OF,
     FIRST_BAND,
+    FIRST_BEHIND,
     HAIR,
     PARTED,
     REGIONS,
     REST,
+    SIDE,
     near_head,
     plain_face,
     region_of,
@@ -28,6 +31,7 @@ from pipeline.template.load import load_template
 from pipeline.visibility import FittedPhoto, Occluder, view_cosines
 from stages.bake.outline_depth import outline_depth
 from stages.bake.unseen import (
+    AROUND,
     CLEAR,
     GRAZING,
     HAIR_CLEAR,
@@ -133,11 +137,15 @@ def test_the_neck_is_divided_by_height(scale: float) -> None:
     world[:3, :3] = scale * turn
     head = PlacedHead(world, np.zeros(0), scale * TEMPLATE.vertices @ turn.T, np.zeros(0), 0.0)
     for points in (middle, collar):
-        band = region_of(scale * points @ turn.T, TEMPLATE, head) - FIRST_BAND
-        ours = band >= 0  # near the jaw and behind the ears other regions are nearer
+        found = region_of(scale * points @ turn.T, TEMPLATE, head)
+        ours = found >= FIRST_BAND  # near the jaw and behind the ears other regions are nearer
         assert ours.mean() > 0.7
+        side, band = np.divmod(found - FIRST_BAND, BANDS)
         expected = np.floor((points[:, 1] - middle[:, 1].min()) / BAND_HEIGHT)
         assert (np.abs(band - expected)[ours] <= 1).all()
+        x, _, z = (points - middle.mean(0)).T
+        angle = np.degrees(np.arctan2(np.abs(x), z))
+        assert (side[ours] == (angle > SIDE)[ours]).all() and 0.5 < side[ours].mean() < 0.9
 
 
 def test_a_band_that_is_not_seen_takes_the_nearest_bands_colour() -> None:
@@ -148,6 +156,43 @@ def test_a_band_that_is_not_seen_takes_the_nearest_bands_colour() -> None:
     albedo[cosine == 0] = 9.0
     found = region_colours(np.zeros((200, 3)), albedo, region, cosine, cosine)[:, 0]
     np.testing.assert_allclose(found, np.repeat([0.1, 0.6, 0.6, 0.6], 50))
+
+
+def test_the_nape_goes_on_as_the_sides_of_the_neck_do() -> None:
+    """A bare throat, hair that covers the sides. Behind, a band that is not seen takes the nearest one behind, unless a
+    band in front is nearer by more than AROUND."""
+    front, sides, above, far = (FIRST_BAND + 5, FIRST_BEHIND + 5, FIRST_BEHIND + 5 + AROUND, FIRST_BEHIND + 12 + AROUND)
+    region = np.repeat([front, sides, above, far, FIRST_BAND + 12 + AROUND], 50)
+    cosine = np.where(np.isin(region, [front, FIRST_BAND + 12 + AROUND]) | (np.arange(250) % 50 < 10), 0.9, 0.0)
+    cosine[np.isin(region, [above, far])] = 0.0
+    albedo = np.where((region < FIRST_BEHIND)[:, None], 0.6, 0.02) * np.ones((250, 3))
+    albedo[region == FIRST_BAND + 12 + AROUND] = 0.3
+    found = region_colours(np.zeros((250, 3)), albedo, region, cosine, cosine)[:, 0]
+    np.testing.assert_allclose(found, np.repeat([0.6, 0.02, 0.02, 0.3, 0.3], 50))
+
+
+def test_what_is_far_from_the_head_takes_what_is_seen_nearby() -> None:
+    """Two halves of a coat, black and white, seen in front: each back has its own half's colour."""
+    points = np.random.default_rng(0).uniform(-0.1, 0.1, (1000, 3)) + [0, -0.5, 0]
+    points[:, 0] += 0.2 * np.sign(points[:, 0])
+    seen = points[:, 2] > 0
+    white = points[:, 0] > 0
+    albedo = np.where(seen, np.where(white, 0.9, 0.05), 7.0)[:, None] * np.ones((1000, 3))
+    found = region_colours(points, albedo, np.full(1000, REST), 0.9 * seen, np.zeros(1000))[:, 0]
+    np.testing.assert_allclose(found[~seen], np.where(white, 0.9, 0.05)[~seen])
+
+
+def test_the_inside_of_the_head_does_not_take_the_colour_of_hair() -> None:
+    """The hollow behind an eye, nearer to the face than to hair; the rest that is seen is a white shirt far below."""
+    face, hair, hollow, back, shirt = (
+        np.array(p) for p in ([0, 0, 0.1], [0, 0.1, 0], [0, 0, 0.06], [0, 0.1, -0.03], [0, -0.5, 0.0])
+    )
+    points = np.repeat([face, hair, hollow, back, shirt], 30, axis=0) + 0.001 * np.arange(150)[:, None] / 150
+    region = np.repeat([REGIONS.index("face"), HAIR, REST, REST, REST], 30)
+    seen = np.repeat([True, True, False, False, True], 30)
+    albedo = np.repeat([0.6, 0.02, 7.0, 7.0, 0.9], 30)[:, None] * np.ones((150, 3))
+    found = region_colours(points, albedo, region, 0.9 * seen, np.ones(150))[:, 0]
+    np.testing.assert_allclose(found[60:120], np.repeat([0.9, 0.02], 30))
 
 
 def test_depth_is_the_distance_from_the_outline_of_the_best_photo(tmp_path: Path) -> None:
