@@ -1,10 +1,8 @@
 """Figures of the quality of charts.
 
 Symbols
-    J       2 x 3 -> the map from texture to surface of one triangle; columns S_u, S_v
-    L2      sqrt((S_u . S_u + S_v . S_v) / 2), root mean square stretch of a triangle [Sander 2001, section 3]
-    Linf    larger singular value of J: the largest stretch in any direction
-    front   where the normal is within 60 degrees of FRONT
+    L2, Linf    stretch of a triangle (stretch.py)
+    front       where the normal is within 60 degrees of FRONT
 """
 
 from __future__ import annotations
@@ -19,11 +17,11 @@ from stages.uv.density import face_share
 from stages.uv.parameterise import signed_areas
 from stages.uv.rough import FRAGMENT
 from stages.uv.segment import FRONT
+from stages.uv.stretch import STRETCHED, stretches
 from stages.uv.unwrap import chart_of_face, evened
 
 RASTER = 1024  # texels: fine enough for charts of a head, and fast
 FACING = 0.5
-STRETCHED = 4.0  # Linf of a face, relative to the mean scale, from which it counts as stretched
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +64,7 @@ def measure(mesh: Mesh, charts: Charts, face: meshes.Mask | None = None, given: 
     mean, most = stretch(mesh, alike, ~flat)
     own = np.ones(len(area), np.bool_) if given is None else ~given
     far = own.copy()
-    far[~flat] &= _stretches(mesh, alike, ~flat)[1] > STRETCHED
+    far[~flat] &= _of_faces(mesh, alike, ~flat)[1] > STRETCHED
     return Quality(
         charts=int(label.max()) + 1,
         fragments=int((np.bincount(label, share) < FRAGMENT).sum()),
@@ -107,22 +105,11 @@ def stretch(mesh: Mesh, charts: Charts, use: meshes.Mask | None = None) -> tuple
     L2(M)^2 = sum_T L2(T)^2 A(T) / sum_T A(T) * (sum A' / sum A)
     """
     keep = np.ones(len(mesh.faces), np.bool_) if use is None else use
-    square, larger, area = _stretches(mesh, charts, keep)
+    square, larger, area = _of_faces(mesh, charts, keep)
     return float(np.sqrt((square * square * area).sum() / area.sum())), float(larger.max())
 
 
-def _stretches(mesh: Mesh, charts: Charts, keep: meshes.Mask) -> tuple[F64, F64, F64]:
-    """(N,) L2 and Linf of some faces, with the texture scaled so that both areas are equal, and their areas."""
-    x = mesh.vertices.astype(np.float64)[mesh.faces[keep]]
-    t = charts.uvs.astype(np.float64)[charts.faces[keep]]
-    e1, e2, d1, d2 = x[:, 1] - x[:, 0], x[:, 2] - x[:, 0], t[:, 1] - t[:, 0], t[:, 2] - t[:, 0]
-    twice: F64 = d1[:, 0] * d2[:, 1] - d1[:, 1] * d2[:, 0]
-    s_u = (e1 * d2[:, 1:] - e2 * d1[:, 1:]) / twice[:, None]
-    s_v = (e2 * d1[:, :1] - e1 * d2[:, :1]) / twice[:, None]
-    square = 0.5 * ((s_u * s_u).sum(1) + (s_v * s_v).sum(1))
-    area = 0.5 * np.linalg.norm(np.cross(e1, e2), axis=1)
-    scale = 0.5 * np.abs(twice).sum() / area.sum()
-    # singular values of J: those of J^T J by its trace and determinant
-    determinant = (s_u * s_u).sum(1) * (s_v * s_v).sum(1) - (s_u * s_v).sum(1) ** 2
-    larger = square + np.sqrt(np.maximum(square * square - determinant, 0))
-    return np.sqrt(square * scale), np.sqrt(larger * scale), area
+def _of_faces(mesh: Mesh, charts: Charts, keep: meshes.Mask) -> tuple[F64, F64, F64]:
+    """(N,) L2 and Linf of the faces keep (F,), and their areas."""
+    corners, texture = mesh.vertices[mesh.faces[keep]], charts.uvs[charts.faces[keep]]
+    return stretches(corners.astype(np.float64), texture.astype(np.float64))

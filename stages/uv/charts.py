@@ -16,11 +16,13 @@ from stages.uv.density import Front, dense_charts, enlarged, face_parted, scale_
 from stages.uv.pack import LOOSEST, boxed, pack
 from stages.uv.parameterise import Flat, parameterised, rigid, signed_areas, unfolded
 from stages.uv.segment import Dual, connected, dual, halved, seam_weights, segment, without_fragments
+from stages.uv.stretch import STRETCHED, stretches
 from stages.uv.tile_count import Tiling, packed
 
 TRUE_STEPS = 6  # ARAP steps on the true surface
 LARGE = 0.2  # of the area: larger charts are split if they fill too little of their rectangle
 FULL = 0.7  # of its rectangle that a large chart should fill
+MOST_STRETCHED = 0.005  # of the area: a chart with more that is stretched is split, as a sleeve laid flat in one piece
 TRIES = 5  # packings
 GOOD_UTILISATION = 0.66  # share of the square under charts from which no chart is split to pack better
 MIN_GAIN = 0.005  # of the square: a packing must gain at least this
@@ -165,15 +167,27 @@ def lies_over_itself(uv: F64, faces: Faces) -> bool:
 
 
 def _must_part(surface: Surface, flats: list[Flat]) -> int | None:
-    """A piece that is not a disc or has mirrored faces, else a large one that fills too little of its rectangle."""
+    """A piece that is not a disc or has mirrored faces, else one that is stretched, else a large one that fills too
+    little of its rectangle."""
     for i, flat in enumerate(flats):
         if not flat.good:
             return i
     total = surface.area.sum()
+    far = [_stretched(surface, flat) for flat in flats]
+    if max(far) > MOST_STRETCHED * total and len(flats) < MAX_CHARTS // 2:  # noise stays stretched in any piece
+        return int(np.argmax(far))
     for i, flat in enumerate(flats):
         if surface.area[flat.member].sum() > LARGE * total and _fill(flat) < FULL and not _front(surface, flat) > 0.5:
             return i
     return None
+
+
+def _stretched(surface: Surface, flat: Flat) -> float:
+    """Area of a good chart's faces that are stretched by more than STRETCHED."""
+    if not surface.area[flat.member].sum() > 0:
+        return 0.0
+    _, most, area = stretches(surface.true[surface.faces[flat.member]], flat.uv[flat.faces])
+    return float(area[most > STRETCHED].sum())
 
 
 def _fill(flat: Flat) -> float:

@@ -8,8 +8,9 @@ charts and 2.5 %. Unusable surfaces had 583 to 3,945 charts, nine in ten of them
 from __future__ import annotations
 
 from pipeline.verdict import Finding, Limits, judged
-from stages.uv.chart_quality import STRETCHED, Quality
+from stages.uv.chart_quality import Quality
 from stages.uv.decimate import Deviation
+from stages.uv.stretch import STRETCHED
 
 # more than 40: the surface can't be cut into a few discs (stages.uv.charts)
 CHARTS = Limits(40, 400, lower=False)

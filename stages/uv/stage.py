@@ -113,4 +113,4 @@ def _saved(built: Built, prefix: str, context: Context) -> UvMesh:
     )
 
 
-STAGE = Stage(name="uv", version=16, inputs=Inputs, config=Config, output=UvMesh, run=run)
+STAGE = Stage(name="uv", version=17, inputs=Inputs, config=Config, output=UvMesh, run=run)
