@@ -15,6 +15,7 @@ from stages.report.by_label import LabelErrors, pooled
 from stages.report.capture_figures import captured
 from stages.report.collect import Results
 from stages.report.compare import JudgedView
+from stages.report.features import feature_figures
 from stages.report.light_stage import shown_field
 from stages.report.metrics import Scores, encoded, mean_scores
 from stages.report.page import Picture, Pictures, ViewRow, render_page
@@ -56,6 +57,7 @@ class JudgedRow:
     model_labels: LabelErrors = field(default_factory=dict)
     asset_labels: LabelErrors = field(default_factory=dict)
     mask_from: str = ""
+    features: dict[str, float] = field(default_factory=dict)
 
 
 def build_rows(view: JudgedView, side: int) -> JudgedRow:
@@ -81,6 +83,7 @@ def build_rows(view: JudgedView, side: int) -> JudgedRow:
         view.model_labels,
         view.asset_labels,
         view.mask_from,
+        view.features,
     )
 
 
@@ -116,7 +119,7 @@ def summary(rows: list[JudgedRow]) -> dict[str, Any]:
     out["by_label"] = {k: v for k, v in labels.items() if v}
     out["per_view"] = {str(r.index): _both(r) for r in rows}
     out["masks"] = {str(r.index): r.mask_from for r in rows}  # by which the subject was told from the rest
-    return out
+    return out | feature_figures({r.index: r.features for r in rows})
 
 
 def _both(row: JudgedRow) -> dict[str, float | None]:

@@ -14,6 +14,7 @@ from pipeline.images import read_alpha, read_encoded, read_exr, read_linear, shr
 from pipeline.polarised import unpolarised
 from stages.report.by_label import LabelErrors, label_errors
 from stages.report.collect import Results, own_colours
+from stages.report.features import feature_shifts
 from stages.report.metrics import Scores, matched, score
 
 F32 = npt.NDArray[np.float32]
@@ -28,7 +29,8 @@ class JudgedView:
     registered_scores: of the model from the camera that the photo's own registration to it found, None where it was not
     registered. own_colours: photos differ in exposure or white balance, and those of this photo are unknown.
     model_labels, asset_labels: errors by the photo's labels, empty if it has none. mask_from: where the mask comes
-    from, as the stage masks names it ("given": the capture's own).
+    from, as the stage masks names it ("given": the capture's own). features: how far those of a face lie from where the
+    photo shows them (feature_shifts).
     """
 
     index: int
@@ -45,6 +47,7 @@ class JudgedView:
     model_labels: LabelErrors = field(default_factory=dict)
     asset_labels: LabelErrors = field(default_factory=dict)
     mask_from: str = ""
+    features: dict[str, float] = field(default_factory=dict)
 
     def shown(self, render: F32) -> F32:
         """A render (H, W, 4) for the page: in the photo's colours, if the fit has a colour response per photo."""
@@ -78,9 +81,11 @@ def judged_views(r: Results) -> Iterator[JudgedView]:
             for x, p in ((model, fitted), (asset, photo), (again, fitted))
         ]
         errors = [_by_label(r, masks[i], x, p, mask, factor) for x, p in ((model, fitted), (asset, photo))]
+        person = r.masks.artifact.landmarks is not None
+        features = feature_shifts(photo, mask, asset) if person and asset is not None else {}
         yield JudgedView(
             i, view.name, view.holdout, photo, mask, model, asset, scores[0], scores[1], scores[2], own, errors[0],
-            errors[1], masks[i].source,
+            errors[1], masks[i].source, features,
         )  # fmt: skip
 
 

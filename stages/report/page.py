@@ -79,6 +79,10 @@ def headline(metrics: Mapping[str, Any]) -> list[tuple[str, str, str]]:
     ):
         if h.get(key) is not None:
             out.append((f"{h[key]:.3f}", what, meaning))
+    if h.get("features_px") is not None:
+        most = f"{h['features_px_most']:.1f} px at most"
+        meaning = f"median distance from where {kind} of 512 px show eyes, brows, nose, mouth, chin; {most}"
+        out.append((f"{h['features_px']:.1f} px", "features of the face, exported asset", meaning))
     out.append(_faces(metrics["uv"]))
     maps = metrics["maps"]
     times = f"{maps['tiles']} × " if maps["tiles"] > 1 else ""

@@ -67,4 +67,4 @@ def run(inputs: Inputs, config: Config, context: Context) -> Report:
     return Report(files=files, warnings=tuple(unjudged(inputs)), findings=findings)
 
 
-STAGE = Stage(name="report", version=19, inputs=Inputs, config=Config, output=Report, run=run)
+STAGE = Stage(name="report", version=20, inputs=Inputs, config=Config, output=Report, run=run)

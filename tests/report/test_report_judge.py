@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import pytest
@@ -24,6 +24,7 @@ class Row:
     asset: Scores | None = SOUND
     model: Scores | None = SOUND
     held_out: bool = True
+    features: dict[str, float] = field(default_factory=dict)
 
 
 def rows(**changes: float) -> list[Row]:
@@ -98,3 +99,14 @@ def test_through_the_stage(tmp_path: Path) -> None:
     found = {f.check: f for f in made.findings}
     assert found["held_out_mask_iou"].value == 1.0 and found["held_out_mask_iou"].level == "good"
     assert {"held_out_psnr", "held_out_worst"} <= set(found)
+
+
+def test_features_of_the_face() -> None:
+    """The farthest of all held-out photos decides; ears, which hair may cover, don't."""
+    made = [replace(r, features={"nose": 0.5, "left ear": 11.0}) for r in rows()]
+    assert by_name(made)["features"].level == "good" and by_name(made)["features"].views == ()
+    made[4] = replace(made[4], features={"chin": 4.4, "nose": 1.0})
+    found = by_name(made)["features"]
+    assert found.level == "usable" and found.value == 4.4 and found.views == ("p4.jpg",) and "chin" in found.said
+    made[4] = replace(made[4], held_out=False)
+    assert by_name(made)["features"].level == "good" and "features" not in by_name(rows())

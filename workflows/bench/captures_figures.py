@@ -93,6 +93,8 @@ def figures_of(run: Run) -> Figures:
         "asset_psnr": held.get("asset_psnr"),
         "asset_psnr_matched": held.get("asset_psnr_matched"),
         "asset_mask_iou": held.get("asset_mask_iou"),
+        "features_px": held.get("features_px"),
+        "features_px_most": held.get("features_px_most"),
         "unseen": run.manifest("bake").get("figures", {}).get("unseen"),
         "charts": run.manifest("uv").get("charts"),
         "seconds": timing.get("total"),

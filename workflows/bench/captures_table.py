@@ -53,6 +53,16 @@ TABLES = (
             Figure("asset_psnr", "asset (dB)", "PSNR of the exported asset over the same pixels", 1, DB),
             Figure("asset_psnr_matched", "matched (dB)", "the same in each photo's own colours", 1, DB),
             Figure(
+                "features_px",
+                "features (px)",
+                "of 512: median distance of the face's features in the asset from where held-out photos show them",
+                -1,
+                0.1,
+                0.0,
+                "{:.1f}",
+            ),
+            Figure("features_px_most", "at most", "the largest of these", -1, 0.5, 0.0, "{:.1f}"),
+            Figure(
                 "mask_median",
                 "masks",
                 "median over photos of each mask's IoU with the hull of the others",
