@@ -39,7 +39,7 @@ def write_run(out: Path, store: Path, better: float, bad: bool) -> None:
         "verdict": {"level": "unusable" if bad else "good", "findings": findings if bad else findings[:1]},
     }
     held = {"views": 2, "held_out": True, "psnr": 19.5, "psnr_matched": 19.6, "asset_psnr": 20.0 + better,
-            "asset_psnr_matched": 20.1}  # fmt: skip
+            "asset_psnr_matched": 20.1, "features_px": 0.62, "features_px_most": 1.4}  # fmt: skip
     (out / "report").mkdir(exist_ok=True)
     (out / "report" / "metrics.json").write_text(json.dumps({"holdout": held}))
     (out / "run.json").write_text(json.dumps(record))

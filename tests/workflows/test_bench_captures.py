@@ -257,7 +257,7 @@ def test_the_page_shows_every_row_and_explains_every_column(root: Path) -> None:
     text = markdown(rows)
     assert "| bad_3 | 3 (unusable) | unusable | 3 of 4 | 2 | masks agreement: the masks do not agree;" in text
     assert "| broken_10 | 1 (failed) | none | - | - | the toy is broken (found: broken_10/7) |" in text
-    assert "| good_2 | 19.50 | 19.60 | - | 20.00 | 20.10 | 0.900 | 0.800 | 25 | 12 | - | - |" in text
+    assert "| good_2 | 19.50 | 19.60 | - | 20.00 | 20.10 | 0.6 | 1.4 | 0.900 | 0.800 | 25 | 12 | - | - |" in text
     shown = [line for line in text.splitlines() if line.startswith("| stage")]
     assert len(shown) == 2  # how it ended and how it was made; nothing was measured
     lines = text.splitlines()
