@@ -16,6 +16,7 @@ Symbols: V vertices; cosine between a normal and the direction to the camera.
 from __future__ import annotations
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from pipeline.maths.smoothstep import smoothstep
 from pipeline.meshes import F64, Indices, Mask
@@ -75,8 +76,6 @@ def region_colours(points: F64, albedo: F64, region: Indices, cosine: F64, depth
 def _nearer(at: F64, to: F64, than: F64) -> Mask:
     """(N,) whether at (N, 3) the points to (M, 3) are nearer than the points than (L, 3); the head's inside is nearer
     to its face than to hair and clothes."""
-    from scipy.spatial import cKDTree
-
     return np.asarray(cKDTree(to).query(at)[0] < cKDTree(than).query(at)[0] if len(than) else np.ones(len(at), bool))
 
 
@@ -88,7 +87,6 @@ def _unlike(band: int, other: int) -> int:
 
 def _inside(points: F64, depth: F64, own: Mask, others: Mask) -> F64:
     """(V,) for the vertices own (V,) the lower of their ranks by depth (V,) and by distance to the others (V,)."""
-    from scipy.spatial import cKDTree
     from scipy.stats import rankdata
 
     out = np.zeros(len(depth))

@@ -1,8 +1,8 @@
 """How far the features of a face lie in a render from where the photo shows them.
 
 The landmark network (pipeline.faces.find) tells where they are in the photo, and no more: it knows what faces look
-like, and follows a nose that is shifted sideways by half of the way only. The shift itself is that at which a window of
-the render, around the feature, correlates best with the photo:
+like, and finds only half of a shift sideways. The shift itself is that at which a window of the render, around the
+feature, correlates best with the photo:
 
     s = argmax NCC(render(x), photo(x + s)),    x in the window, |s| <= REACH in both directions
 

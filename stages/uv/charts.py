@@ -173,9 +173,10 @@ def _must_part(surface: Surface, flats: list[Flat]) -> int | None:
         if not flat.good:
             return i
     total = surface.area.sum()
-    far = [_stretched(surface, flat) for flat in flats]
-    if max(far) > MOST_STRETCHED * total and len(flats) < MAX_CHARTS // 2:  # noise stays stretched in any piece
-        return int(np.argmax(far))
+    if len(flats) < MAX_CHARTS // 2:  # noise stays stretched in any piece
+        far = [_stretched(surface, flat) for flat in flats]
+        if max(far) > MOST_STRETCHED * total:
+            return int(np.argmax(far))
     for i, flat in enumerate(flats):
         if surface.area[flat.member].sum() > LARGE * total and _fill(flat) < FULL and not _front(surface, flat) > 0.5:
             return i
